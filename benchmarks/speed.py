@@ -1,12 +1,15 @@
 """What Sealscope costs: each row by this version, beside a pinned one or a peer in turns, and how time and memory grow.
 
-    python benchmarks/speed.py [--beside PYTHON] [--quick] [--rounds 3] [--only TEXT ...] [--json FILE]
+    python benchmarks/speed.py [--beside PYTHON] [--limit 300] [--quick] [--rounds 3] [--only TEXT ...] [--json FILE]
+                               [--eha FILE ...]
 
 `--beside`: the Python of an environment with another version; both versions run on the same files, one after the other
-in each round, and the ratio of the medians of their processor times is printed. `--quick`: sizes of seconds, to see
-that all works. `--only`: the rows whose titles hold one of the texts, or `growth`, `service`, `cores`, `libraries`,
-`solver`. `--json`: the figures for the page of speed, which the documentation writes from
-`benchmarks/results/speed.json`; rows that are not chosen stay. All recordings are simulated or computed by this
+in each round, and the ratio of the medians of their processor times is printed. `--limit`: a run of the other version
+ends after so many seconds of the processor; the row then states that it takes more. `--eha`: the logs of a real
+actuator that `real_eha.py` takes, of which the first is judged beside the others but the last. `--quick`: sizes of
+seconds, to see that all works. `--only`: the rows whose titles hold one of the texts, or `growth`, `service`, `cores`,
+`libraries`, `solver`. `--json`: the figures for the page of speed, which the documentation writes from
+`benchmarks/results/speed.json`; rows that are not chosen stay. All other recordings are simulated or computed by this
 version. The asked figures are those of the project's requirements, at full size, on two virtual cores.
 """
 
@@ -16,17 +19,21 @@ import argparse
 import json
 import os
 import platform
+import resource
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from datetime import date
 from functools import cache, partial
+from math import inf, isfinite
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
 from typing import Any, NamedTuple
 
 import bench_solvers
 import numpy as np
+import real_eha
 from bench_diagnosis import of_many
 
 import sealscope as ss
@@ -38,15 +45,16 @@ _ROW = """
 import json, os, sys, tempfile, time
 from dataclasses import replace
 import sealscope as ss
-kind, names, channels = json.loads(sys.argv[1])
+kind, names, channels, map, sizes = json.loads(sys.argv[1])
+rig = ss.load_rig("single-rod-eha").with_overrides(sizes) if sizes else None
 def read(is_new=True):
-    recordings = [ss.read(name) for name in names]
+    recordings = [ss.read(name, map=map) for name in names]
     if is_new:
         run = str(time.time_ns())
         recordings = [replace(recording, provenance={**recording.provenance, "run": run}) for recording in recordings]
     return [recording.only(channels) for recording in recordings] if channels else recordings
 def diagnose(recordings):
-    return ss.diagnose(recordings[0], baseline=recordings[1:])
+    return ss.diagnose(recordings[0], baseline=recordings[1:], rig=rig)
 if kind == "commission":
     def copy():
         folder = tempfile.mkdtemp(dir=os.path.dirname(names[0]))
@@ -111,23 +119,34 @@ print(f"\\n{json.dumps(shares)}\\n{time.process_time()} {peak.split()[1]}", file
 
 
 class Run(NamedTuple):
-    """What a run of a row costs."""
+    """What a run of a row costs; all numbers are infinite if it did not end within the limit."""
 
     seconds: float  # of the processor
     memory: float  # peak [MiB]
     shares: dict[str, float]  # part of the package -> share of the time of the whole process, the largest ones
 
 
-#: Measurement: a run by a Python.
-Row = Callable[[str], Run]
+#: Measurement: a run by a Python, of at most so many seconds of the processor.
+Row = Callable[[str, int | None], Run]
 
 
-def spent(python: str, *words: str, **variables: str) -> tuple[Run, str]:
-    """Run `_COMMAND` with words by a Python, with further environment `variables`; return what it costs, its output."""
+def spent(python: str, *words: str, limit: int | None = None, **variables: str) -> tuple[Run, str]:
+    """Run `_COMMAND` with words by a Python, with further environment `variables`; return what it costs, its output.
+
+    `limit`: most seconds of the processor; the output of a process that takes more is empty.
+    """
+
+    def limit_time() -> None:
+        """Limit the processor's time of the process."""
+        if limit is not None:
+            resource.setrlimit(resource.RLIMIT_CPU, (limit, limit))
+
     # an installed package has its bytecode: modules are not compiled in each process
     environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "", **variables}
     call = [python, "-c", _COMMAND, *words]
-    process = subprocess.run(call, capture_output=True, text=True, check=False, env=environment)
+    process = subprocess.run(call, capture_output=True, text=True, check=False, env=environment, preexec_fn=limit_time)
+    if limit is not None and process.returncode in (-signal.SIGXCPU, -signal.SIGKILL):
+        return Run(inf, inf, {}), ""
     if process.returncode:
         raise SystemExit(f"{' '.join(words[:2])[:80]} ended with {process.returncode}: {process.stderr[-500:]}")
     *_, shares, last = process.stderr.splitlines()
@@ -135,29 +154,39 @@ def spent(python: str, *words: str, **variables: str) -> tuple[Run, str]:
     return Run(float(seconds), float(peak) / 1024.0, json.loads(shares)), process.stdout
 
 
-def of_library(kind: str, files: Sequence[Path], channels: Sequence[str] = ()) -> Row:
-    """Make a row that calls the library; its time is that of the call alone."""
-    job = json.dumps([kind, [str(file) for file in files], list(channels)])
+def of_library(
+    kind: str,
+    files: Sequence[Path],
+    channels: Sequence[str] = (),
+    column_map: dict[str, str] | None = None,
+    sizes: dict[str, str] | None = None,
+) -> Row:
+    """Make a row that calls the library; its time is that of the call alone.
 
-    def run(python: str) -> Run:
+    `channels`: those that are kept, by default all; `column_map`, `sizes`: map of the columns, and sizes of an
+    electro-hydrostatic actuator with a single rod, if they are stated.
+    """
+    job = json.dumps([kind, [str(file) for file in files], list(channels), column_map, sizes])
+
+    def run(python: str, limit: int | None = None) -> Run:
         """Run the call in a process; its time is that of the call, its memory that of the process."""
-        cost, output = spent(python, "-", _ROW, job)
-        return cost._replace(seconds=float(output))
+        cost, output = spent(python, "-", _ROW, job, limit=limit)
+        return cost._replace(seconds=float(output)) if output else cost
 
     return run
 
 
 def of_command(*words: str) -> Row:
     """Make a row that runs a command of the program; its time is that of the whole process."""
-    return lambda python: spent(python, *words)[0]
+    return lambda python, limit: spent(python, *words, limit=limit)[0]
 
 
 def of_first_command(folder: Path, *words: str) -> Row:
     """Make a row that runs a command of the program as its first one: with an empty folder for compiled code."""
 
-    def run(python: str) -> Run:
+    def run(python: str, limit: int | None) -> Run:
         """Run the command with a new folder."""
-        return spent(python, *words, SEALSCOPE_CACHE_DIR=mkdtemp(dir=folder))[0]
+        return spent(python, *words, limit=limit, SEALSCOPE_CACHE_DIR=mkdtemp(dir=folder))[0]
 
     return run
 
@@ -167,7 +196,7 @@ def measure_libraries(file: Path, pythons: Sequence[str], rounds: int) -> dict[s
     libraries = "import numpy, scipy.linalg, scipy.special, scipy.ndimage, numba, typer, rich, pydantic, h5netcdf, pywt"
     ratios = []
     for python in pythons:
-        of_command("diagnose", str(file))(python)
+        of_command("diagnose", str(file))(python, None)
         pairs = [(spent(python, "diagnose", str(file))[0], spent(python, "-", libraries)[0]) for _ in range(rounds)]
         whole, bare = np.median([[run.seconds for run in pair] for pair in pairs], axis=0)
         ratios.append(f"{whole / bare:.2f} times the processor time of importing its libraries alone ({whole:.2f} s)")
@@ -230,6 +259,8 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--only", nargs="+", default=[], metavar="TEXT", help="rows whose names hold one of these")
     parser.add_argument("--json", type=Path, help="file of the figures")
+    parser.add_argument("--limit", type=int, default=300, help="processor's seconds of a run of the other version")
+    parser.add_argument("--eha", nargs="+", type=Path, default=[], metavar="FILE", help="logs of a real actuator")
     chosen = parser.parse_args()
     share = 0.1 if chosen.quick else 1.0
     rounds = 1 if chosen.quick else chosen.rounds
@@ -265,6 +296,7 @@ def main() -> None:
                 *(0.15, None),
                 lambda: of_library("again", minutes()[: 1 + n_beside]),
             ),
+            **actuator(chosen.eha),
             f"commissioning, {3 * 1.5 * share:g} h at 10 Hz": (9.0, None, lambda: of_library("commission", days())),
             f"commissioning, {share:g} h at 1 kHz": (10.0, None, lambda: of_library("commission", hour())),
             f"`diagnose` of {share:g} h at 1 kHz, a text of 6 columns": (
@@ -287,14 +319,19 @@ def main() -> None:
             if chosen.only and not any(text in title for text in chosen.only):
                 continue
             row = make_row()
-            runs = [[row(python) for python in pythons] for _ in range(rounds)]  # in turns
+            limits = (None, chosen.limit)  # of this version, and of the other one
+            runs = [[row(*pair) for pair in zip(pythons, limits, strict=False)] for _ in range(rounds)]  # in turns
             medians = np.median(np.array([[run[:2] for run in pair] for pair in runs]), axis=0)
             figures[title] = {"seconds": medians[0][0], "MiB": medians[0][1], "shares": runs[0][0].shares}
             if not chosen.quick:  # what is asked is asked of the full size
                 figures[title] |= {"asked": asked} | ({"asked MiB": asked_memory} if asked_memory else {})
-            if chosen.beside:
+            ratio = ""
+            if chosen.beside and isfinite(medians[1][0]):
                 figures[title]["ratio"] = medians[0][0] / medians[1][0]
-            ratio = f"{figures[title]['ratio']:.2f}" if chosen.beside else ""
+                ratio = f"{figures[title]['ratio']:.2f}"
+            elif chosen.beside:
+                figures[title]["limit"] = chosen.limit
+                ratio = f"the other version > {chosen.limit} s"
             goal = figures[title].get("asked", "")
             shares = ", ".join(f"{area} {100.0 * share:.0f} %" for area, share in runs[0][0].shares.items())
             print(f"| {title} | {medians[0][0]:.3g} | {goal} | {ratio} | {medians[0][1]:.0f} | {shares} |", flush=True)
@@ -326,6 +363,17 @@ def main() -> None:
         chosen.json.write_text(json.dumps(measured, indent=1) + "\n", encoding="utf-8")
 
 
+def actuator(files: Sequence[Path]) -> dict[str, tuple[float | None, float | None, Callable[[], Row]]]:
+    """Make the rows of a real actuator from its logs; none without them."""
+    names = ("cylinder.A_A", "cylinder.A_B", "pump.q_b")
+    sizes = dict(zip(names, (*real_eha.AREAS, real_eha.DISPLACEMENT), strict=True))
+    of_logs = partial(of_library, column_map=real_eha.MAP, sizes=sizes)
+    kinds = {"first": (2.0, files[:-1]), "next": (0.3, files)}
+    title = f"real EHA, 25 s at 1 kHz beside {len(files) - 2}"
+    rows = {f"{title}, {kind}": (asked, None, partial(of_logs, kind, logs)) for kind, (asked, logs) in kinds.items()}
+    return rows if files else {}
+
+
 def measure_service(seconds: float, actuators: int) -> dict[str, str]:
     """Run `bench_monitor.py` on so many seconds of so many actuators, and return its lines about the service."""
     call = [sys.executable, str(Path(__file__).with_name("bench_monitor.py")), "--seconds", f"{seconds:g}"]
@@ -347,7 +395,7 @@ def growth(folder: Path, share: float) -> dict[str, float]:
     }
     exponents = {}
     for title, (sizes, calls) in rows.items():
-        runs = [call(sys.executable) for call in calls]
+        runs = [call(sys.executable, None) for call in calls]
         costs = {title: [run.seconds for run in runs], f"{title} (memory)": [run.memory for run in runs]}
         for name, values in costs.items():
             exponents[name] = float(np.polyfit(np.log(sizes), np.log(np.maximum(values, 1e-9)), 1)[0])

@@ -178,7 +178,7 @@ def speed() -> str:
     for work, row in verdicts["rows"].items():
         shares = ", ".join(f"{area} {100 * share:.0f} %" for area, share in row.get("shares", {}).items())
         asked, memory = (f" ({row[name]:g})" if row.get(name) else "" for name in ("asked", "asked MiB"))
-        ratio = f"{row['ratio']:.2f}" if "ratio" in row else ""
+        ratio = f"{row['ratio']:.2f}" if "ratio" in row else f"that took > {row['limit']} s" if "limit" in row else ""
         lines.append(f"| {work} | {row['seconds']:.2g}{asked} | {ratio} | {row['MiB']:.0f}{memory} | {shares} |")
     if verdicts["growth"]:
         growth = ", ".join(f"{power:.1f} of the {name}" for name, power in verdicts["growth"].items())
