@@ -228,13 +228,13 @@ def flag_lowering(
     relative_load[is_missing] = 1.0
     # a leak may equalise the pressures: the piston that it moves is as fast as the load was just before
     limit = largest_before(relative_load, max(1, round(MIN_REST * rate)))
-    del relative_load, is_missing
+    del is_missing
     np.sqrt(limit, out=limit)
     limit *= limits.creep
     np.maximum(limit, limits.noise, out=limit)
     velocity = np.nan_to_num(np.diff(x), copy=False)
     velocity *= rate
-    excess = average_over(AVERAGING_TIME, velocity, rate)
+    excess = average_over(AVERAGING_TIME, velocity, rate, in_place=True)
     np.abs(excess, out=excess)
     excess -= limit
     del velocity, limit
@@ -246,9 +246,10 @@ def flag_lowering(
 
     is_turning = extend_both_ways(~rests)  # averages next to motion contain some of it
     window = min(max(1, round(MIN_REST * rate)), len(rests))  # [samples]
-    # over the window after each sample, times its length
-    mean_excess, n_turning = (_window_sums(values, window) for values in (excess, is_turning))
-    is_lowering = ~is_turning & (excess > 0.0) & extend_flags((mean_excess > 0.0) & (n_turning == 0), window)
+    # on average over the window after each sample, in which the pump rests
+    is_free = _window_sums(excess, window) > 0.0
+    is_free &= _window_sums(is_turning.view(np.int8), window) == 0
+    is_lowering = ~is_turning & (excess > 0.0) & extend_flags(is_free, window)
     for first, length in find_runs(~is_lowering).tolist():
         if length < INFERENCE.rest.shortest_hold * rate and not is_turning[first : first + length].any():
             is_lowering[first : first + length] = True
@@ -304,15 +305,15 @@ def is_in_motion(fractions: Array) -> NDArray[np.bool_]:
 
 
 def largest_before(values: Array, length: int) -> Array:
-    """Find the largest of each value (n,) and the `length` - 1 values before it."""
+    """Find the largest of each value (n,) and the `length` - 1 values before it; `values` then hold the result."""
     from scipy.ndimage import maximum_filter1d
 
-    return np.asarray(maximum_filter1d(values, length, mode="nearest", origin=(length - 1) // 2))
+    return np.asarray(maximum_filter1d(values, length, mode="nearest", origin=(length - 1) // 2, output=values))
 
 
 def _window_sums(values: NDArray[Any], length: int) -> NDArray[Any]:
     """Sum each of the values (n,) and the `length` - 1 values after it, shape (n - `length` + 1,)."""
-    sums = np.cumsum(values)
+    sums: NDArray[Any] = np.cumsum(values, dtype=np.float64 if values.dtype.kind == "f" else np.int32)
     windows = sums[length - 1 :].copy()
     windows[1:] -= sums[:-length]
     return windows

@@ -85,8 +85,8 @@ def select_motion(recording: Recording) -> Motion | None:
     increments = np.diff(values) if is_position else values / rate  # changes of the position between samples
     slowest = rest_limit(increments, rate, fraction=CHANGES.healthy.slowest)
     del increments
-    speed = average_over(AVERAGING_TIME, rate * np.gradient(values) if is_position else values, rate)
-    acceleration = average_over(AVERAGING_TIME, rate * np.gradient(speed), rate)
+    speed = _average_slope(values, rate) if is_position else average_over(AVERAGING_TIME, values, rate)
+    acceleration = _average_slope(speed, rate)
     is_known = np.isfinite(speed) & np.isfinite(acceleration) & np.isfinite(values)
     is_known &= np.isfinite(recording["p_A"]) & np.isfinite(recording["p_B"])
     rows = np.flatnonzero(is_known & (np.abs(speed) > slowest))
@@ -108,6 +108,15 @@ def select_motion(recording: Recording) -> Motion | None:
         ]
     )
     return Motion(rows, design, number_strokes(speed[rows], recording.t[rows]), top_speed)
+
+
+def _average_slope(values: Array, rate: float) -> Array:
+    """Compute the time derivative of values (n,), averaged over `AVERAGING_TIME`, with one array alone."""
+    slope = np.empty_like(values)
+    np.subtract(values[2:], values[:-2], out=slope[1:-1])
+    slope[1:-1] *= 0.5 * rate
+    slope[0], slope[-1] = rate * (values[1] - values[0]), rate * (values[-1] - values[-2])
+    return average_over(AVERAGING_TIME, slope, rate, in_place=True)
 
 
 def _hat_functions(position: Array, n_knots: int) -> Array:
