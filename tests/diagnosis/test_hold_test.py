@@ -147,6 +147,10 @@ def test_a_side_at_vacuum_is_read_by_its_means():
         assert len(read_channel(t, p, 1e5).t) <= 140
         (result,) = ss.hold_test(record_hold(1.0, rate=0.5, p_B=lambda s: np.interp(s, t, p)), area=AREAS)  # noqa: B023
         assert result.leak_lpm > 0.0
+    # a sensor whose readings are below any pressure, so that no oil is compressed
+    noise = 2e4 * np.random.default_rng(4).standard_normal(600)
+    (result,) = ss.hold_test(record_hold(1.0, rate=1.0, p_B=lambda t: -1.2e5 + noise[: len(t)]), area=AREAS)
+    assert result.leak_lpm > 0.0
 
 
 def test_cooling_of_a_tight_cylinder_fails_no_small_limit():

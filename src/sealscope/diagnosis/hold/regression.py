@@ -162,7 +162,9 @@ class RateRegression:
         n_choices, quantum = len(choices), self.readings.quantum
         rows = np.arange(len(gram) * n_choices)
         prior = (self.log_noise[:, None] + log_priors).ravel()
-        variance = np.ones(len(rows)) if quantum else np.repeat(gram[:, 0, 0], n_choices) / m
+        variance = np.ones(len(rows))
+        if not quantum:
+            variance = np.maximum(np.repeat(gram[:, 0, 0], n_choices) / m, LEAST_DEVIATION**2)
         # the rate is the last coefficient, which needs no back substitution
         system = (
             gram,
