@@ -119,6 +119,22 @@ def test_a_port_that_opens_ends_the_hold_at_any_pressure():
             ss.hold_test(recording.between(301.0, 320.0), area=AREAS)
 
 
+def test_equal_pressures_on_both_sides_are_no_load():
+    """A piston that leaks behind shut valves has equal pressures soon, and would seem tight from then on."""
+    t = np.arange(0.0, 600.0, 0.1)
+    for time, named in ((5.0, "across the piston"), (2000.0, None)):
+        half = 2e6 * np.exp(-t / time)
+        noise = 2e3 * np.random.default_rng(5).standard_normal((2, t.size))
+        channels = {"p_A": 5e6 + half + noise[0], "p_B": 5e6 - half + noise[1]}
+        recording = ss.Recording(t, channels, dict.fromkeys(channels, "Pa"), rate=10.0)
+        if named is None:
+            (result,) = ss.hold_test(recording, area=AREAS, oil="40 degC steady")
+            assert result.causes == ("piston",)
+        else:
+            with pytest.raises(InputError, match=named):
+                ss.hold_test(recording, area=AREAS)
+
+
 def test_a_locked_chamber_leaks_by_the_fall_of_its_pressure():
     t = np.arange(0.0, 300.0, 0.1)
     random = np.random.default_rng(2)
@@ -240,7 +256,7 @@ def test_a_leak_that_has_equalised_the_sides_is_converted_by_its_pressure():
 
 def test_equal_pressures_without_noise_give_finite_intervals():
     t = np.arange(0.0, 600.0, 1.0)
-    p_A = 5e6 + np.round(20.0 * np.exp(-t / 60.0)) * 1e5
+    p_A = 5e6 + np.round(40.0 * np.exp(-t / 60.0)) * 1e5
     recording = ss.Recording(t, {"p_A": p_A, "p_B": np.full_like(t, 5e6)}, {"p_A": "Pa", "p_B": "Pa"}, rate=1.0)
     (result,) = ss.hold_test(recording, area=AREAS, loaded="A")
     assert np.isfinite(result.leak_interval_lpm).all()

@@ -25,7 +25,7 @@ from sealscope.recordings.channels import CHAMBERS, COUNTS, FLOW_SOURCES
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.motion import is_constant
 from sealscope.recordings.quality import Finding, inspect
-from sealscope.recordings.recording import Recording
+from sealscope.recordings.recording import Array, Recording
 from sealscope.units import BAR
 
 
@@ -175,7 +175,7 @@ def _select_samples(recording: Recording) -> Recording:
 def _cut_holds(samples: Recording, set_up: SetUp) -> list[Recording]:
     """Cut the holds out of a log, or out of the part whose start or end is stated; with both, this part is the hold.
 
-    A part in which the side of the load is at the tank's pressure holds none. Raises InputError if no hold is left.
+    A part without a load (`_find_load`) is none. Raises InputError if no hold is left.
     """
     extent, shortest = f"in a log of {len(samples)} samples over {samples.duration:.3g} s", HOLD.part.shortest
     low, high = (-np.inf if set_up.start is None else set_up.start), (np.inf if set_up.end is None else set_up.end)
@@ -191,13 +191,21 @@ def _cut_holds(samples: Recording, set_up: SetUp) -> list[Recording]:
     if not held:
         longest = f"{max(durations):.3g} s at most" if durations else "none"
         raise InputError(f"a hold must last {shortest:g} s with 5 samples or more, got {longest} {extent}")
-    load, tank = max(pressures, key=lambda p: float(np.median(p)), default=None), HOLD.other.tank * BAR
+    load, tank = _find_load(pressures), HOLD.other.tank * BAR
     # beside a position, a single chamber may be the one without the load
     if load is not None and (len(pressures) > 1 or x is None or float(np.median(load)) > tank):
-        loads = [float(np.median(load[first : last + 1])) for first, last in held]
+        loads = [float(np.mean(load[first : last + 1])) for first, last in held]
         if max(loads) < tank:
-            raise InputError(
-                f"a hold needs a load of {tank / BAR:g} bar or more, got {max(loads) / BAR:.2g} bar {extent}"
-            )
+            sides = " across the piston" if len(pressures) > 1 else ""
+            got = f"{max(loads) / BAR:.2g} bar {extent}"
+            raise InputError(f"a hold needs a load of {tank / BAR:g} bar or more{sides}, got {got}")
         held = [part for part, held_load in zip(held, loads, strict=True) if held_load >= tank]
     return [samples.samples(slice(first, last + 1)) for first, last in held]
+
+
+def _find_load(pressures: Sequence[Array]) -> Array | None:
+    """Find what drives a leak: the pressure (n,) of the one chamber, or the difference of both; None without any.
+
+    Behind shut valves a piston that leaks soon has equal pressures on both sides, which tell nothing more.
+    """
+    return np.abs(pressures[0] - pressures[1]) if len(pressures) == 2 else next(iter(pressures), None)
