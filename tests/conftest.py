@@ -149,7 +149,7 @@ def drive() -> Callable[..., Trajectory]:
 @pytest.fixture(autouse=True)
 def nothing_learnt_before(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let no test see what others learnt of the same recording, perhaps under other priors: results are not kept."""
-    monkeypatch.setattr("sealscope.diagnosis.learnt.results_folder", lambda: None)
+    monkeypatch.setattr("sealscope.diagnosis.healthy.results_folder", lambda: None)
 
 
 @pytest.fixture(autouse=True)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.signal import butter, sosfilt
 
-from sealscope.diagnosis.healthy import SummarisedRecording
+from sealscope.diagnosis.healthy import SummarisedRecording, summary_table
 from sealscope.diagnosis.inference.changes.healthy_levels import HealthyLevels
 from sealscope.diagnosis.inference.changes.pressure_bands import PAIRS, Octaves, compare_spectra, compute_octaves
 from sealscope.recordings.recording import Recording
@@ -53,9 +53,10 @@ def chances(recording: Recording) -> dict[str, float]:
 def test_friction_and_drifts_are_those_of_the_recording(contact: float) -> None:
     learnt = HealthyLevels().learn(record(3e5, drift_A=2e5, drift_B=-1e5, contact=contact))
     assert learnt is not None
-    assert 2.0 * learnt["friction_pressure"] == pytest.approx(2 * 3e5, rel=0.03)
-    assert learnt["friction_error"] < 0.05 * learnt["friction_pressure"]
-    assert (learnt["drift_A"], learnt["drift_B"]) == (pytest.approx(2e5, rel=0.05), pytest.approx(-1e5, rel=0.05))
+    assert learnt.friction is not None
+    assert 2.0 * learnt.friction.value == pytest.approx(2 * 3e5, rel=0.03)
+    assert learnt.friction.deviation < 0.05 * learnt.friction.value
+    assert (learnt.drift_A, learnt.drift_B) == (pytest.approx(2e5, rel=0.05), pytest.approx(-1e5, rel=0.05))
 
 
 def test_each_change_shows_in_its_number_alone() -> None:
@@ -220,7 +221,7 @@ def test_healthy_days_without_spectra_leave_the_other_comparisons(known: int) ->
             None,
             {"signals": {key: learnt[key] for key in learnt if key not in PAIRS or k < known}},
         )
-        for k, learnt in enumerate(HealthyLevels().learn(day) or {} for day in HEALTHY)
+        for k, learnt in enumerate(summary_table(HealthyLevels(), day) or {} for day in HEALTHY)
     ]
     found = {observable.name: observable.chance for observable in HealthyLevels().compare(record(5e5, seed=9), days)}
     assert expected.pop("filter of p_A", 1.0) * expected.pop("filter of p_B", 1.0) > 0.01
@@ -229,7 +230,8 @@ def test_healthy_days_without_spectra_leave_the_other_comparisons(known: int) ->
 
 def test_spectra_alone_are_learnt_of_a_piston_that_rests() -> None:
     still = record()
-    assert set(HealthyLevels().learn(still.only(["p_A", "p_B"])) or ()) == {"octaves"}
+    learnt = HealthyLevels().learn(still.only(["p_A", "p_B"]))
+    assert learnt is not None and set(learnt.table()) == {"octaves"}
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])

@@ -8,28 +8,31 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.estimate.population import weigh_alternatives
-from sealscope.diagnosis.inference.hypotheses import MachineOdds, compare_residuals, temper
+from sealscope.diagnosis.inference.hypotheses import MachineOdds, RecordingOdds, compare_residuals, temper
 from sealscope.diagnosis.priors.inference import INFERENCE
 
 
 def test_the_healthy_sign_counts_no_more_than_a_sensor_that_was_rewired() -> None:
     rewired = INFERENCE.sense.rewired
-    summaries = [{"sign_log_odds": np.array([12.0])}] * 9
+    summaries = [RecordingOdds(sign_log_odds=np.array([12.0]))] * 9
     assert MachineOdds.from_healthy(summaries, 1).flow_sign == pytest.approx(np.log((1.0 - rewired) / rewired))
-    assert MachineOdds.from_healthy([{}], 1).flow_sign == 0.0
-    other_channels = {"sign_log_odds": np.array([-1.0, 2.0])}
+    assert MachineOdds.from_healthy([RecordingOdds()], 1).flow_sign == 0.0
+    other_channels = RecordingOdds(sign_log_odds=np.array([-1.0, 2.0]))
     np.testing.assert_array_equal(MachineOdds.from_healthy([*summaries, other_channels], 2).flow_sign, [-1.0, 2.0])
 
 
 def test_the_odds_of_the_valves_add_up_within_what_one_recording_may_tell() -> None:
     prior, limit, sure = INFERENCE.rest.shut_odds, INFERENCE.rest.single_odds_limit, INFERENCE.rest.sure_odds
-    assert MachineOdds.from_healthy([{}], 1) == MachineOdds(flow_sign=np.zeros(1))
-    doubtful = [{"shut_odds": 0.5}, {"shut_odds": -9.0}, {}]
+    assert MachineOdds.from_healthy([RecordingOdds()], 1) == MachineOdds(flow_sign=np.zeros(1))
+    doubtful = [RecordingOdds(shut_odds=0.5), RecordingOdds(shut_odds=-9.0), RecordingOdds()]
     assert MachineOdds.from_healthy(doubtful, 1).valves == pytest.approx(prior + 0.5 - limit)
     assert MachineOdds.from_healthy(doubtful, 1, scatter_log_odds=2.0).valves == pytest.approx(prior + 2.5 - limit)
-    for key in ("shut_odds", "held_odds"):
-        assert MachineOdds.from_healthy([{key: sure + 0.1}, {}], 1).is_valve_certain
-        assert not MachineOdds.from_healthy([{key: sure - 0.1}], 1).is_valve_certain
+    for above, below in (
+        (RecordingOdds(shut_odds=sure + 0.1), RecordingOdds(shut_odds=sure - 0.1)),
+        (RecordingOdds(held_odds=sure + 0.1), RecordingOdds(held_odds=sure - 0.1)),
+    ):
+        assert MachineOdds.from_healthy([above, RecordingOdds()], 1).is_valve_certain
+        assert not MachineOdds.from_healthy([below], 1).is_valve_certain
 
 
 def test_residuals_that_repeat_count_as_few() -> None:

@@ -94,22 +94,23 @@ def test_a_piston_that_a_servo_holds_does_not_move() -> None:
 
 
 def test_one_stroke_up_tells_neither_friction_nor_a_drift() -> None:
-    learnt = HealthyLevels().learn(record(strokes(0.4), drift_A=4e5)) or {}
-    assert not {"friction_pressure", "drift_A"} & set(learnt)
+    learnt = HealthyLevels().learn(record(strokes(0.4), drift_A=4e5))
+    assert learnt is None or (learnt.friction is None and not learnt.drifts)
 
 
 def test_one_stroke_each_way_tells_friction_and_hardly_a_drift() -> None:
     learnt = HealthyLevels().learn(record(strokes(0.4, 0.0)))
     assert learnt is not None
-    assert learnt["friction_pressure"] == pytest.approx(2e5, rel=0.02)
-    assert learnt.get("drift_A_error", np.inf) > 1e5
+    assert learnt.friction_pressure == pytest.approx(2e5, rel=0.02)
+    assert learnt.drift_A_error is None or learnt.drift_A_error > 1e5
 
 
 def test_strokes_that_pass_the_same_places_tell_a_drift() -> None:
     learnt = HealthyLevels().learn(record(strokes(0.4, 0.0, 0.3, 0.1, 0.4, 0.0), drift_A=4e5))
     assert learnt is not None
-    assert learnt["drift_A"] == pytest.approx(4e5, abs=3.0 * learnt["drift_A_error"])
-    assert learnt["drift_A_error"] < 2e4
+    drift = learnt.drifts["A"]
+    assert drift.value == pytest.approx(4e5, abs=3.0 * drift.deviation)
+    assert drift.deviation < 2e4
 
 
 @pytest.mark.parametrize("seed", range(5))

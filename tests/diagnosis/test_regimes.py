@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sealscope.diagnosis.inference.comparison.recording_sums import BalanceSummary
 from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.equations.terms import TURNING
 from sealscope.diagnosis.inference.hypotheses import MachineOdds, Valves
@@ -16,7 +17,7 @@ from sealscope.diagnosis.inference.regimes import recorded_blocks
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
-from sealscope.diagnosis.inference.volumes.volume_detector import _sums_from_summary as learnt_sums
+from sealscope.diagnosis.inference.volumes.volume_detector import _fit_sums as fit_sums
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.parameters import load_rig
 from sealscope.recordings.channels import CHANNEL_UNITS
@@ -101,7 +102,7 @@ def balance(seed: int, odds: float = 0.0, **options: Any) -> RecordedBalance:
 
 
 @cache
-def summaries() -> list[dict[str, Any]]:
+def summaries() -> list[BalanceSummary]:
     """Learn three healthy recordings."""
     learnt = [VolumeBalance(RIG).learn(press(seed)) for seed in range(3)]
     return [summary for summary in learnt if summary is not None]
@@ -226,7 +227,7 @@ def test_a_machine_that_is_switched_on_does_not_leak_from_then_on(start: float) 
 @pytest.mark.slow
 def test_healthy_recordings_tell_which_it_is_for_a_leaking_one() -> None:
     detector = VolumeBalance(RIG)
-    odds = sum(summary["shut_odds"] for summary in summaries())
+    odds = sum(summary.shut_odds or 0.0 for summary in summaries())
     assert odds > 4.0
     leaking = press(7, leak=1e-13)
     assert balance(7, odds=odds, leak=1e-13).valves is Valves.SHUT
@@ -243,7 +244,7 @@ def test_a_hold_behind_valves_tells_a_leak_from_a_pump_that_differs_from_day_to_
     ]
     summaries = [detector.learn(recording) for recording in healthy]
     assert all(
-        summary is not None and min(summary["held_odds"], summary["shut_odds"]) > INFERENCE.rest.sure_odds
+        summary is not None and min(summary.held_odds or 0.0, summary.shut_odds or 0.0) > INFERENCE.rest.sure_odds
         for summary in summaries
     )
     for leak in (0.0, 5e-14):
@@ -288,7 +289,7 @@ def test_a_locked_hold_measures_the_seal_alone(leak: float) -> None:
 @pytest.mark.parametrize("leak", few([2e-14, 0.0], 1))
 def test_the_bound_is_the_holds_where_they_know_better(leak: float) -> None:
     judged = balance(7, odds=np.inf, leak=leak)
-    healthy = [learnt_sums(summary, judged.columns) for summary in summaries()]
+    healthy = [fit_sums(summary, judged.columns) for summary in summaries()]
     held, wide = BalanceLeak(judged, healthy), Rise(leak, 5e-14, np.inf)
     held.__dict__["_motion_rise"] = wide
     assert leak * judged.mean_pressure() < held.bound_flow
@@ -299,7 +300,7 @@ def test_the_bound_is_the_holds_where_they_know_better(leak: float) -> None:
 def test_a_rise_that_began_within_the_recording_is_dated_by_the_holds() -> None:
     for leak, since in ((1e-13, 0.0), (1e-13, 50.0)):
         judged = balance(7, odds=np.inf, leak=leak, since=since)
-        healthy = [learnt_sums(summary, judged.columns) for summary in summaries()]
+        healthy = [fit_sums(summary, judged.columns) for summary in summaries()]
         onset = BalanceLeak(judged, healthy).rise_onset
         assert (onset is None) == (since == 0.0)
         assert onset is None or onset.low <= since <= onset.high

@@ -14,7 +14,6 @@ import sealscope as ss
 from sealscope.diagnosis.estimate.change import Information
 from sealscope.diagnosis.estimate.interval import WITHIN_95
 from sealscope.diagnosis.inference.pressures.fit import Priors
-from sealscope.diagnosis.inference.pressures.leak import HealthyResponse
 from sealscope.diagnosis.inference.pressures.reduced_rig import (
     C_C,
     F_C,
@@ -175,9 +174,9 @@ def test_the_law_of_most_healthy_recordings_is_that_of_the_machine() -> None:
     """One healthy recording that another law of friction describes takes the others nothing away."""
     recordings = [ss.simulate(command="3 sin(4t)", duration=20.0, seed=seed) for seed in (1, 2, 3)]
     *healthy, judged = [measure_leak(recording, THESIS, is_healthy=True) for recording in recordings]
-    known = [HealthyResponse(leak.law, leak.conditions) for leak in healthy]
-    other = HealthyResponse("bristles", judged.conditions)
-    assert {leak.law for leak in healthy} == {"stribeck"}
+    known = [leak.conditions for leak in healthy]
+    other = replace(judged.conditions, law="bristles")
+    assert {leak.conditions.law for leak in healthy} == {"stribeck"}
     with_other, without = (measure_leak(recordings[2], THESIS, responses) for responses in ([*known, other], known))
     assert with_other.rise.value == without.rise.value
 

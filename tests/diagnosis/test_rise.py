@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -144,8 +145,8 @@ def test_a_day_of_other_oil_is_no_leak(days: Sequence[int], draws: int) -> None:
 def test_recordings_without_a_date_are_of_one_day() -> None:
     random = np.random.default_rng(3)
     *healthy, judged = fleet(random, (1, 1, 1, 1), 0.0, PRIORS)
-    undated = [own._replace(start_s=None) for own in (*healthy, judged)]
-    alike, later = rise(judged, healthy, (COLUMNS,)), judged._replace(start_s=DAY * 2)
+    undated = [replace(own, start_s=None) for own in (*healthy, judged)]
+    alike, later = rise(judged, healthy, (COLUMNS,)), replace(judged, start_s=DAY * 2)
     assert rise(undated[-1], undated[:-1], (COLUMNS,))[:2] == alike[:2]
     assert rise(later, healthy, (COLUMNS,)).deviation > 5.0 * alike.deviation
 
@@ -319,7 +320,7 @@ def test_a_rise_with_a_share_of_the_false_alarms_needs_a_higher_score(share: flo
 def test_recordings_of_any_size_have_a_rise_and_a_threshold(scale: float) -> None:
     random = np.random.default_rng(6)
     *healthy, judged = fleet(random, (1, 1, 2, 3), 0.1, PRIORS)
-    scaled = [own._replace(sums=own.sums * scale, flow=own.flow * scale) for own in (*healthy, judged)]
+    scaled = [replace(own, sums=own.sums * scale, flow=own.flow * scale) for own in (*healthy, judged)]
     with np.errstate(all="ignore"):
         made = rise(scaled[-1], scaled[:-1], (COLUMNS,))
     assert 0.0 <= made.chance <= 1.0 and made.threshold(0.01) > 0.0
@@ -433,7 +434,7 @@ def oily_days(random: np.random.Generator, leak: float, error: float, *, shows: 
         drop = 1e6 * np.exp(log_drop + error * random.standard_normal())
         sums = RecordingSums.from_blocks(recording(random, level), (COLUMNS,), DAY * number)
         fit = Resistance(friction=1e5, friction_error=1e3, drop=drop, drop_error=error * drop, top_speed=0.1)
-        return sums._replace(resistance=np.array(fit))
+        return replace(sums, resistance=np.array(fit))
 
     *healthy, judged = (day(number, thinner) for number, thinner in enumerate(thinning))
     return rise(judged, healthy, (COLUMNS,))
@@ -510,7 +511,7 @@ def test_a_scale_is_another_machine_only_at_speeds_that_are_known() -> None:
         for scales in ([1.0] * 5, [1.03])
     )
     (usual,) = compare_motion(day[0], healthy, MOVING)
-    (slow,) = compare_motion(day[0]._replace(flow=0.5 * FLOW), healthy, MOVING)
+    (slow,) = compare_motion(replace(day[0], flow=0.5 * FLOW), healthy, MOVING)
     assert usual.chance < 1e-3 and slow.chance > 0.05
     assert usual.size == pytest.approx(slow.size)
 
@@ -518,15 +519,15 @@ def test_a_scale_is_another_machine_only_at_speeds_that_are_known() -> None:
 def test_conditions_that_no_healthy_recording_had_are_named() -> None:
     random = np.random.default_rng(10)
     own = RecordingSums.from_blocks(recording(random, 20.0 * PRIORS), (COLUMNS,), DAY, 40.0)
-    healthy = [own, own._replace(oil_degC=46.0, pressure=1.1 * PRESSURE)]
+    healthy = [own, replace(own, oil_degC=46.0, pressure=1.1 * PRESSURE)]
     assert not find_unusual_conditions(own, healthy)
-    warmer = find_unusual_conditions(own._replace(oil_degC=60.0, pressure=1.87 * PRESSURE), healthy)
+    warmer = find_unusual_conditions(replace(own, oil_degC=60.0, pressure=1.87 * PRESSURE), healthy)
     assert [(of.name, of.low, of.high) for of in warmer] == [
         ("load", PRESSURE, pytest.approx(1.1 * PRESSURE)),
         ("oil", 40.0, 46.0),
     ]
     assert warmer[0].log_excess == pytest.approx(np.log(1.7))
-    loaded = own._replace(pressure=1.87 * PRESSURE)
+    loaded = replace(own, pressure=1.87 * PRESSURE)
     assert rise(loaded, healthy, (COLUMNS,)).deviation > rise(own, healthy, (COLUMNS,)).deviation
 
 

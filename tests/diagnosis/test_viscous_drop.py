@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -94,7 +96,7 @@ def test_a_judged_drop_may_have_another_cause_than_the_oil() -> None:
     prior = INFERENCE.oil.drop_misleads / (1.0 - INFERENCE.oil.drop_misleads)
     odds = []
     for friction in (1.0, 2.0):
-        swollen = sums._replace(resistance=fit * [friction, 1.0, 2.0, 1.0, 1.0])
+        swollen = replace(sums, resistance=fit * [friction, 1.0, 2.0, 1.0, 1.0])
         oils = oil_hypotheses([sums, sums, swollen])
         mute = [oil for oil in oils if oil.thinning[-1] == 0.0 and oil.slope_deviation > 0.0]
         told = [oil for oil in oils if oil.thinning[-1] < 0.0]
@@ -123,8 +125,8 @@ def test_a_drop_that_does_not_show_tells_no_oil() -> None:
 @pytest.mark.parametrize("spoilt", [{"drop_error": 0.0}, {"friction_error": -1.0}, {"top_speed": 1e-300}])
 def test_a_resistance_that_would_be_divided_by_zero_is_refused(spoilt: dict[str, float]) -> None:
     learnt = VolumeBalance(load_rig("thesis")).learn(simulate(duration="20 s", seed=1))
-    assert learnt is not None
-    check_summary("volume balance", learnt)
-    fit = Resistance(*learnt["resistance"])._replace(**spoilt)
+    assert learnt is not None and learnt.resistance is not None
+    check_summary("volume balance", learnt.table())
+    fit = Resistance(*learnt.resistance)._replace(**spoilt)
     with pytest.raises(ArithmeticError, match="resistance"):
-        check_summary("volume balance", {**learnt, "resistance": np.array(fit)})
+        check_summary("volume balance", {**learnt.table(), "resistance": np.array(fit)})

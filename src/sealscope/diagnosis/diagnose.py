@@ -21,10 +21,10 @@ from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.decision.reasons import text_of
 from sealscope.diagnosis.detectors.observation import healthy_null, limit_threads, observe_rivals, run_detector
 from sealscope.diagnosis.detectors.registry import detectors
-from sealscope.diagnosis.healthy import Healthy, SummarisedRecording, Summary
+from sealscope.diagnosis.healthy import Healthy, SummarisedRecording
 from sealscope.diagnosis.hold.hold_test import judge_held_recording
 from sealscope.diagnosis.hold.recorded_holds import (
-    HOLD_SUMMARY,
+    HoldSummary,
     describe_holds,
     estimate_growth,
     find_shown_leak,
@@ -153,10 +153,10 @@ class Examination:
         return replace(evidence, share=self.share * evidence.share, judged_until=judged_until)
 
 
-def _summarise_holds(healthy: Sequence[Healthy], areas: Sequence[float] | None) -> list[Summary]:
+def _summarise_holds(healthy: Sequence[Healthy], areas: Sequence[float] | None) -> list[HoldSummary]:
     """Summarise the longest hold of each healthy recording of a held load (`summarise_hold`); `areas` [m^2]."""
     summaries = (
-        entry.summaries.get(HOLD_SUMMARY)
+        entry.summary(HoldSummary)
         if isinstance(entry, SummarisedRecording)
         else summarise_hold(judge_held_recording(entry, areas))
         for entry in healthy

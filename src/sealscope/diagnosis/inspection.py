@@ -14,8 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.healthy import Healthy, SummarisedRecording
-from sealscope.diagnosis.learnt import learn_once
+from sealscope.diagnosis.healthy import Healthy, SummarisedRecording, learn_once
 from sealscope.paragraphs import join_names
 from sealscope.recordings.channels import CHANNEL_UNITS, SLOW, chambers_of
 from sealscope.recordings.corrections.samples import correct_samples

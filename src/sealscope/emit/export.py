@@ -14,9 +14,9 @@ from sealscope.calls import checked_call
 from sealscope.diagnosis.commissioned.machine import CommissionedMachine
 from sealscope.diagnosis.healthy import Healthy
 from sealscope.diagnosis.inference.balance_samples import absolute_offset
+from sealscope.diagnosis.inference.comparison.recording_sums import BalanceSummary
 from sealscope.diagnosis.inference.equations.balances import PUMP_VOLUMES
 from sealscope.diagnosis.inference.rows.row_weights import SUPPORT
-from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.live.joining import SampleRun
 from sealscope.diagnosis.live.kernel.stream import RESULTS, StreamSettings
 from sealscope.diagnosis.live.live_balance import BLOCK_SECONDS, LiveBalance, NotJudged
@@ -175,12 +175,12 @@ def controller_rig(machine: CommissionedMachine) -> Rig:
     """Return the rig of a machine; if its displacement is not stated, with the one that healthy recordings show.
 
     Where the piston's areas are stated, the balance of each recording shows the displacement as a multiple of the
-    assumed one (`scale` of `VolumeBalance.learn`); here the median counts.
+    assumed one (`BalanceSummary.scale`); here the median counts.
     """
     rig = machine.rig or unstated_rig()
     recordings = [recording for recording in machine.healthy if not measures_flow(recording.units)]
-    summaries = [recording.summaries.get(VolumeBalance.name, {}) for recording in recordings]
-    scales = [float(summary["scale"]) for summary in summaries if summary.get("scale", 0.0) > 0.0]
+    summaries = [recording.summary(BalanceSummary) for recording in recordings]
+    scales = [summary.scale for summary in summaries if summary is not None and summary.scale > 0.0]
     if rig.states("pump.q_b") or not scales:
         return rig
     return rig.with_overrides({"pump.q_b": rig.pump.q_b * float(np.median(scales))}, source="by the piston's areas")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from base64 import b64decode, b64encode
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
@@ -48,7 +49,7 @@ def restore_array(value: Any, name: str) -> NDArray[np.float64]:
     """
     try:
         shape = tuple(int(size) for size in value["shape"])
-        if min(shape, default=0) < 0 or np.prod(shape, dtype=float) > _MAX_SIZE:  # float: no overflow
+        if min(shape, default=0) < 0 or math.prod(shape) > _MAX_SIZE:
             raise ValueError(f"got shape {shape}")
         data = b64decode(value["f8"], validate=True)
         return np.frombuffer(data, dtype="<f8").reshape(shape).astype(np.float64)

@@ -12,7 +12,14 @@ import numpy as np
 import pytest
 
 import sealscope as ss
-from sealscope.diagnosis.commissioned.healthy_file import SUFFIX, Line, format_summary, parse_summary, read_lines
+from sealscope.diagnosis.commissioned.healthy_file import (
+    SUFFIX,
+    SUMMARY_TYPES,
+    Line,
+    format_summary,
+    parse_summary,
+    read_lines,
+)
 from sealscope.diagnosis.rms_change.rms_detector import RmsChange
 from sealscope.errors import InputError
 from sealscope.storage.plain_state import plain_array
@@ -52,6 +59,37 @@ def test_a_summary_is_read_as_it_was_learnt(machine):
     assert format_summary(again) == format_summary(learnt)
     np.testing.assert_array_equal(again.summaries["a plug-in's"].pop("curve"), [0.1, 0.2])
     assert again.summaries["a plug-in's"] == {"names": ["a", "b"], "n": 3}
+
+
+def test_a_file_of_an_earlier_version_is_read_and_written_to_the_byte():
+    """A simulated machine, a press whose valves shut at rest, and a hold test, as plain tables were written."""
+    lines, kinds = read_lines(Path(__file__).with_name("earlier.healthy")), set()
+    for line in lines:
+        recording = parse_summary(line, "earlier", "place")
+        restored = [summary for kind in SUMMARY_TYPES if (summary := recording.summary(kind)) is not None]
+        kinds |= {type(summary) for summary in restored}
+        tables = {summary.method: summary.table() for summary in restored}
+        assert format_summary(replace(recording, summaries=tables)) == line
+    assert len(lines) == 3 and kinds == set(SUMMARY_TYPES)
+
+
+@pytest.mark.parametrize(
+    ("method", "entries"),
+    [
+        ("hold test", {"bar": 0.0}),
+        ("rms change", {"duty": np.zeros(3)}),
+        ("pressure response", {"law": "sand"}),
+        ("volume balance", {"holds": np.zeros(3)}),
+        ("signals", {"octaves": np.zeros((4, 2))}),
+    ],
+)
+def test_a_summary_with_a_wrong_entry_is_refused(method, entries):
+    lines = read_lines(Path(__file__).with_name("earlier.healthy"))
+    recordings = [parse_summary(line, "earlier", "place") for line in lines]
+    recording = next(recording for recording in recordings if method in recording.summaries)
+    table = recording.summaries[method]
+    with refusal(next(iter(entries))):
+        format_summary(replace(recording, summaries={method: {**table, **entries}}))
 
 
 def test_the_text_is_small(pair, machine):
@@ -283,7 +321,7 @@ def test_a_main_method_that_cannot_run_is_never_no_leak(machine, monkeypatch):
 def test_what_could_not_be_read_again_is_not_learnt(folder, tmp_path, monkeypatch):
     """The other methods' summaries are kept, and the machine is written."""
     learn = RmsChange.learn
-    monkeypatch.setattr(RmsChange, "learn", lambda *words: {**learn(*words), "levels": np.full(10, -np.inf)})
+    monkeypatch.setattr(RmsChange, "learn", lambda *words: replace(learn(*words), levels=np.full(10, -np.inf)))
     machine = ss.commission(folder / "run1.nc", rig="thesis")
     assert "rms change" not in machine.healthy[0].summaries
     assert len(ss.read_machine(ss.write_machine(machine, tmp_path / "m.toml")).healthy) == 1

@@ -14,24 +14,21 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Collection, Iterator, Mapping
+from dataclasses import MISSING, fields
 from hashlib import sha256
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple, get_type_hints
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, FailFast, Field, create_model
 
-from sealscope.diagnosis.healthy import SummarisedRecording, Summary
-from sealscope.diagnosis.inference.changes.features import SIGNALS
-from sealscope.diagnosis.inference.changes.healthy_levels import DRIFT_KEYS, FRICTION_KEYS, ZERO_KEYS
-from sealscope.diagnosis.inference.changes.pressure_bands import MIN_OCTAVES, PAIRS, Octaves
-from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
-from sealscope.diagnosis.inference.comparison.recording_sums import Resistance
-from sealscope.diagnosis.inference.equations.terms import LEAK
-from sealscope.diagnosis.rms_change.rms_detector import DUTY
-from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE, RMS_CHANGE, VOLUME_BALANCE
+from sealscope.diagnosis.healthy import Magnitude, Number, Positive, SummarisedRecording, Summary, Time
+from sealscope.diagnosis.hold.recorded_holds import HoldSummary
+from sealscope.diagnosis.inference.changes.healthy_levels import LevelSummary
+from sealscope.diagnosis.inference.comparison.recording_sums import BalanceSummary
+from sealscope.diagnosis.inference.pressures.samples import ResponseSummary
+from sealscope.diagnosis.rms_change.rms_detector import DetailSummary
 from sealscope.errors import InputError
-from sealscope.signals.details import QUANTITIES
 from sealscope.storage.atomic import atomic_write
 from sealscope.storage.opening import open_regular
 from sealscope.storage.plain_state import plain_array, restore_array
@@ -44,14 +41,6 @@ MAX_SIZE, _MAX_LINE, _MAX_SUMMARIES = 50_000_000, 5_000_000, 5000
 #: Most commas, brackets and braces in a line: the first number plus the second times the number of bytes. The limit
 #: saves memory, as each of these marks becomes an object.
 _MAX_MARKS, _MAX_FRACTION = 40, 0.1
-#: Largest magnitude of a number, so that products of two numbers do not overflow.
-_MAX_NUMBER = 1e100
-#: First and last time that `datetime` can represent, about the years 1 and 9999 [s since 1970].
-_FIRST_TIME, _LAST_TIME = -6.2e10, 2.5e11
-#: Largest magnitude of the logarithm of a number that is neither zero nor infinite (double precision).
-_MAX_LOGARITHM = 750.0
-#: Largest ratio of a squared sum of products to the product of the sums of squares: 1 (Cauchy), plus rounding errors.
-_ROUNDING = 1.0 + 1e-6
 #: Length of a checksum in hexadecimal digits.
 _DIGITS = 64
 
@@ -96,167 +85,31 @@ def list_type(value_type: Any, min_length: int = 0) -> Any:
     return Annotated[list[value_type], FailFast(), Field(min_length=min_length)]
 
 
-def _array_type(*shape: int) -> Any:
-    """Make a pydantic type for an array of finite numbers below 1e100 in magnitude, of any shape if none is given."""
+def _summary_type(kind: type[Summary]) -> Any:
+    """Make a pydantic type for the table of a `kind` of summary: its fields, checked as they and `check` say.
 
-    def check_array(value: Any) -> Any:
-        """Return the value unchanged; raise ValueError if it is no such array."""
-        if not isinstance(value, np.ndarray):
-            raise ValueError("must be an array of numbers")
-        if not (np.abs(value) < _MAX_NUMBER).all():
-            raise ValueError(f"must hold finite numbers with a magnitude below {_MAX_NUMBER:g}")
-        if shape and value.shape != shape:
-            raise ValueError(f"must be of the shape {shape}, got {value.shape}")
-        return value
-
-    return Annotated[Any, AfterValidator(check_array)]
-
-
-def _check_sums(summary: Any) -> Any:
-    """Return the `summary` by a volume balance (`_BALANCE`) if it is consistent; raise ValueError otherwise.
-
-    The array `sums` (E, m, m) has for each of E balances the sums of products of its m columns: the `terms`, which must
-    include the leak, and the left side, a flow. Leak and left side must have positive sums of squares, and obey
-    Cauchy's inequality. `shut_sums` (1, m + 2, m + 2) are the sums if valves cut the pump off at rest, which needs two
-    more columns.
+    Other entries, of a later version, are kept.
     """
-    size = len(summary.terms) + 1
-    if summary.sums.ndim != 3 or not len(summary.sums) or summary.sums.shape[1:] != (size, size):
-        raise ValueError(f"sums must be of the shape (E, {size}, {size}), got {summary.sums.shape}")
-    shut = summary.shut_sums
-    if shut is not None and shut.shape != (1, size + 2, size + 2):
-        raise ValueError(f"shut_sums must be of the shape (1, {size + 2}, {size + 2}), got {shut.shape}")
-    if summary.stroke is not None and summary.stroke[0] > summary.stroke[1]:
-        raise ValueError(f"stroke must hold the lower and the upper end of the motion, got {summary.stroke}")
-    if summary.resistance is not None:
-        fit = Resistance(*summary.resistance)
-        if min(fit.friction_error, fit.drop_error, fit.top_speed) < 1.0 / _MAX_NUMBER:  # these are divisors
-            raise ValueError("resistance must hold positive standard errors and a positive speed")
-    if LEAK not in summary.terms:
-        raise ValueError(f"terms must include {LEAK!r}, got {', '.join(summary.terms)}")
-    leak = summary.terms.index(LEAK)
-    squares = summary.sums[:, [leak, -1], [leak, -1]]  # (E, 2): sums of squares of leak and left side
-    product = summary.sums[:, leak, -1]
-    if not (squares > 0.0).all() or not (product**2 <= _ROUNDING * squares.prod(axis=1)).all():
-        raise ValueError("sums must be sums of squares and products of a leak and a flow, got other numbers")
-    return summary
+    hints = get_type_hints(kind, include_extras=True)
+    types = {entry.name: (hints[entry.name], ... if entry.default is MISSING else None) for entry in fields(kind)}
+
+    def check_entries(table: Any) -> Any:
+        """Return the table unchanged; raise ValueError if its entries do not fit each other."""
+        kind.restore(vars(table)).check()
+        return table
+
+    return Annotated[table_type("allow", **types), AfterValidator(check_entries)]
 
 
-def _check_levels(summary: Any) -> Any:
-    """Return the `summary` of wavelet details (`_RMS`) if its arrays are valid; raise ValueError otherwise.
-
-    `levels` (5 per chamber,) are logarithms of the RMS of the details, and `duty` (4,) the features `DUTY`: three
-    logarithms and a ratio.
-    """
-    expected = (len(QUANTITIES) * len(summary.chambers),)
-    if not summary.chambers or summary.levels.shape != expected or summary.duty.shape != (len(DUTY),):
-        shapes = f"{summary.levels.shape} and {summary.duty.shape}"
-        raise ValueError(f"levels and duty must be of the shapes {expected} and ({len(DUTY)},), got {shapes}")
-    if not max(np.abs(summary.levels).max(), np.abs(summary.duty).max()) < _MAX_LOGARITHM:
-        raise ValueError(f"levels and duty must be logarithms with a magnitude below {_MAX_LOGARITHM:g}")
-    return summary
-
-
-def _check_response(summary: Any) -> Any:
-    """Return the `summary` by a pressure response if it is consistent; raise ValueError otherwise.
-
-    `law` is a law of friction; the array `sums` (1, p + 1, p + 1) holds the likelihood of p parameters (`Joint.sums`).
-    """
-    from sealscope.diagnosis.inference.pressures.reduced_rig import LAWS, PARAMETERS
-
-    if summary.law not in LAWS:
-        raise ValueError(f"law must be {' or '.join(LAWS)}, got {summary.law!r}")
-    size = len(PARAMETERS) + 1
-    if summary.sums.shape != (1, size, size):
-        raise ValueError(f"sums must be of the shape (1, {size}, {size}), got {summary.sums.shape}")
-    return summary
-
-
-def _check_octaves(values: Any) -> Any:
-    """Return the spectra of a pair of channels in octaves if they are valid; raise ValueError otherwise.
-
-    `values` (4, k) has the fields of `Octaves` for each of k octaves: logarithms of the RMS of both channels, their
-    phase [rad], and the variance of the phase's error [rad^2].
-    """
-    if values.ndim != 2 or len(values) != len(Octaves._fields) or values.shape[1] < MIN_OCTAVES:
-        shape = f"({len(Octaves._fields)}, k), k >= {MIN_OCTAVES}"
-        raise ValueError(f"octaves must be of the shape {shape}, got {values.shape}")
-    if not np.abs(values).max() < _MAX_LOGARITHM or (values[-1] < 0.0).any():
-        raise ValueError(f"octaves must hold logarithms, phases and variances below {_MAX_LOGARITHM:g} in magnitude")
-    return values
-
-
-# types of values; `_BALANCE` and `_RMS` are those of the summaries by `VolumeBalance.learn` and `RmsChange.learn`
-_Array = _array_type()
-_Number = Annotated[float, Field(gt=-_MAX_NUMBER, lt=_MAX_NUMBER)]
-_Magnitude = Annotated[float, Field(ge=0.0, lt=_MAX_NUMBER)]
-_Positive = Annotated[float, Field(gt=0.0, lt=_LAST_TIME)]
-_Time = Annotated[float, Field(gt=_FIRST_TIME, lt=_LAST_TIME)]
-_BALANCE = table_type(
-    "allow",
-    terms=list_type(str),
-    scale=_Magnitude,
-    sums=_Array,
-    shut_sums=(_Array, None),
-    held=(_array_type(len(HeldLeaks._fields)), None),
-    held_pump=(_array_type(2), None),
-    shut_odds=(_Number, None),
-    held_odds=(_Number, None),
-    creep_odds=(_Number, None),
-    sign_log_odds=(_Array, None),
-    stroke=(_array_type(2), None),
-    flow=_Magnitude,
-    pressure=_Magnitude,
-    start_s=(_Time, None),
-    oil_degC=(_Number, None),
-    resistance=(_array_type(len(Resistance._fields)), None),
-)
-_RMS = table_type(
-    "allow",
-    chambers=list_type(str),
-    recorded=list_type(str),
-    rate=_Positive,
-    start_s=(_Time, None),
-    levels=_Array,
-    duty=_Array,
-)
-#: Numbers in the summary of friction and drifts, and their standard errors.
-_SIGNAL_NUMBERS = (*FRICTION_KEYS, *DRIFT_KEYS, *ZERO_KEYS)
-#: Types of the summaries of Sealscope's own methods; those of others are plain tables.
-_SUMMARIES = {
-    VOLUME_BALANCE: (Annotated[_BALANCE, AfterValidator(_check_sums)], None),
-    PRESSURE_RESPONSE: (
-        Annotated[
-            table_type(
-                "allow",
-                law=str,
-                sums=_Array,
-                flow=_Magnitude,
-                pressure=_Magnitude,
-                start_s=(_Time, None),
-                oil_degC=(_Number, None),
-            ),
-            AfterValidator(_check_response),
-        ],
-        None,
-    ),
-    RMS_CHANGE: (Annotated[_RMS, AfterValidator(_check_levels)], None),
-    SIGNALS: (
-        table_type(
-            "allow",
-            **{name: (_Magnitude if name.endswith("_error") else _Number, None) for name in _SIGNAL_NUMBERS},
-            **{name: (Annotated[_Array, AfterValidator(_check_octaves)], None) for name in PAIRS},
-        ),
-        None,
-    ),
-}
+#: Summaries by Sealscope's own methods; those of others are plain tables.
+SUMMARY_TYPES: tuple[type[Summary], ...] = (BalanceSummary, ResponseSummary, DetailSummary, LevelSummary, HoldSummary)
 _ABOUT = {
-    "pressure_bar": _Number,
-    "oil_degC": _Number,
-    "noise": uniform_table_type(_Magnitude),
+    "pressure_bar": Number,
+    "oil_degC": Number,
+    "noise": uniform_table_type(Magnitude),
     "log_units": uniform_table_type(str),
     "wrong": list_type(str),
-    "defects": uniform_table_type(_Number),
+    "defects": uniform_table_type(Number),
 }
 
 
@@ -276,16 +129,18 @@ def _restore_arrays(value: Any, name: str) -> Any:
 
 
 _RESTORED = BeforeValidator(lambda value: _restore_arrays(value, ""))
-_BY_METHOD: Any = Annotated[table_type("allow", **_SUMMARIES), _RESTORED]
+_BY_METHOD: Any = Annotated[
+    table_type("allow", **{kind.method: (_summary_type(kind), None) for kind in SUMMARY_TYPES}), _RESTORED
+]
 _RECORDING = table_type(
     digest=Annotated[str, Field(min_length=1, max_length=200)],
     units=uniform_table_type(str),
-    rate=_Positive,
-    seconds=_Positive,
-    start_s=(_Time, None),
+    rate=Positive,
+    seconds=Positive,
+    start_s=(Time, None),
     about=(table_type("allow", **{name: (kind, None) for name, kind in _ABOUT.items()}), None),
     summaries=_BY_METHOD,
-    statistics=(uniform_table_type(_Number), None),
+    statistics=(uniform_table_type(Number), None),
 )
 
 
@@ -315,14 +170,14 @@ def _format_json(value: Any) -> bytes:
     return json.dumps(_pack_arrays(value), allow_nan=False, sort_keys=True, separators=(",", ":")).encode("ascii")
 
 
-def check_summary(method: str, summary: Summary) -> None:
-    """Check that the summary by the detector `method` can be stored and read back.
+def check_summary(method: str, table: Mapping[str, Any]) -> None:
+    """Check that the table of the summary by the detector `method` can be stored and read back.
 
     Raises TypeError for a value that is not plain, else ArithmeticError, which `log_failure` attributes to the
     recording if the detector is built in.
     """
     try:
-        convert_type(_BY_METHOD, parse_json(_format_json({method: summary})))
+        convert_type(_BY_METHOD, parse_json(_format_json({method: table})))
     except ValueError as error:
         raise ArithmeticError(f"no summary: {error}") from None
 

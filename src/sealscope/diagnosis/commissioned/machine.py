@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -21,10 +21,9 @@ from sealscope.diagnosis.commissioned.cross_check import cross_check
 from sealscope.diagnosis.detectors.observation import limit_threads, stored_surprisals
 from sealscope.diagnosis.detectors.registry import detectors, log_failure, unusable_reason
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY, diagnose
-from sealscope.diagnosis.healthy import SummarisedRecording, Summary
+from sealscope.diagnosis.healthy import SummarisedRecording, summary_table
 from sealscope.diagnosis.hold.hold_test import judge_held_recording
 from sealscope.diagnosis.hold.recorded_holds import (
-    HOLD_SUMMARY,
     is_hold_results,
     read_hold_results,
     summarise_hold,
@@ -319,25 +318,25 @@ def summarise_healthy(recording: Recording, rig: Rig, file: str) -> SummarisedRe
         part = inspection.part
         if inspection.defect is not None:
             raise InputError(f"a healthy recording must be whole, got one that is not: {inspection.defect} ({file})")
-        summaries: dict[str, Summary] = {}
+        summaries = dict[str, Mapping[str, Any]]()
         with np.errstate(all="ignore"):
             for name, factory in detectors().items():
                 try:
                     detector = factory(rig)
                     can_learn = hasattr(detector, "learn") and unusable_reason(detector, part) is None
-                    if can_learn and (summary := detector.learn(part)) is not None:  # type: ignore[attr-defined]
-                        check_summary(name, summary)
-                        summaries[name] = summary
+                    if can_learn and (table := summary_table(detector, part)) is not None:  # type: ignore[arg-type]
+                        check_summary(name, table)
+                        summaries[name] = table
                 except Exception as error:  # as in a diagnosis, a method that fails is left out
                     distribution = getattr(factory, "distribution", None)  # package of a plug-in, None if built in
                     log_failure(name, distribution, error)
         cylinder, is_stated = rig.cylinder, rig.states("cylinder.A_A", "cylinder.A_B")
         holds = judge_held_recording(recording, (cylinder.A_A, cylinder.A_B) if is_stated else None)
         if (hold := summarise_hold(holds)) is not None:
-            summaries[HOLD_SUMMARY] = hold
+            summaries[hold.method] = hold.table()
         if not summaries:
             raise InputError(f"a healthy recording must have channels that a method can use, got none ({file})")
-        if (levels := HealthyLevels().learn(part)) is not None:  # friction, drifts and spectra
+        if (levels := summary_table(HealthyLevels(), part)) is not None:  # friction, drifts and spectra
             summaries[HealthyLevels.name] = levels
         return SummarisedRecording(
             file,

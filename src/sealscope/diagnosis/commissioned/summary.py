@@ -13,14 +13,14 @@ import numpy as np
 
 from sealscope.diagnosis.commissioned.cross_check import BY_OTHERS
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY
-from sealscope.diagnosis.hold.recorded_holds import HOLD_SUMMARY
+from sealscope.diagnosis.hold.recorded_holds import HoldSummary
+from sealscope.diagnosis.inference.comparison.recording_sums import BalanceSummary
 from sealscope.diagnosis.inference.equations.balances import circulation, equations
 from sealscope.diagnosis.inference.equations.signals import Signals
 from sealscope.diagnosis.inference.machine_states import find_rests
 from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.inspection import Inspection
 from sealscope.diagnosis.priors.commissioned import COMMISSIONED
-from sealscope.diagnosis.verdict.evidence import VOLUME_BALANCE
 from sealscope.diagnosis.verdict.machine_sizes import unstated_rig
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.paragraphs import paragraphs
@@ -30,7 +30,7 @@ from sealscope.recordings.recording import Array, Recording
 from sealscope.units import BAR, LITRE_PER_MINUTE, P_ATM, from_si
 
 if TYPE_CHECKING:
-    from sealscope.diagnosis.healthy import SummarisedRecording, Summary
+    from sealscope.diagnosis.healthy import SummarisedRecording
     from sealscope.parameters import Rig
 
 
@@ -157,9 +157,7 @@ def _describe_limit(healthy: Sequence[SummarisedRecording], limit: str | None) -
     if limit is not None:
         return f"{RepairLimit.parse(limit)}, as stated"
     text = f"none is stated: {RepairLimit.parse(None)} counts, which a maker allows a boom"
-    summaries = [recording.summaries.get(VOLUME_BALANCE, {}) for recording in healthy]
-    # "scale": factor from the flow of the balance to the true flow, 0 if unknown
-    flow = max((summary.get("delivered", 0.0) * summary.get("scale", 0.0) for summary in summaries), default=0.0)
+    flow = max((summary.delivered * summary.scale for summary in _balance_summaries(healthy)), default=0.0)
     if not flow > 0.0:
         return text
     proposal = RepairLimit(COMMISSIONED.limit.share * flow, "flow", stated=False)
@@ -169,9 +167,7 @@ def _describe_limit(healthy: Sequence[SummarisedRecording], limit: str | None) -
 
 def _format_duty(healthy: Sequence[SummarisedRecording], pressure_unit: str) -> str:
     """Format the ranges of pump flow, pressure difference and oil temperature, as far as they are known."""
-    summaries = [recording.summaries.get(VOLUME_BALANCE, {}) for recording in healthy]
-    # "scale": factor from the flow of the balance to the true flow, 0 if unknown
-    flows = [summary.get("flow", 0.0) * summary.get("scale", 0.0) / LITRE_PER_MINUTE for summary in summaries]
+    flows = [summary.flow * summary.scale / LITRE_PER_MINUTE for summary in _balance_summaries(healthy)]
     ranges = {
         "L/min": [flow for flow in flows if flow > 0.0],
         f"{pressure_unit} between the chambers": [
@@ -189,10 +185,15 @@ def _format_duty(healthy: Sequence[SummarisedRecording], pressure_unit: str) -> 
     return ", ".join(texts)
 
 
+def _balance_summaries(healthy: Sequence[SummarisedRecording]) -> list[BalanceSummary]:
+    """Collect the summaries by the volume balance."""
+    return [summary for recording in healthy if (summary := recording.summary(BalanceSummary)) is not None]
+
+
 def _format_holds(healthy: Sequence[SummarisedRecording]) -> str:
     """Format number, leaks and pressures of the healthy hold tests; "" without any."""
-    holds = [recording.summaries[HOLD_SUMMARY] for recording in healthy if HOLD_SUMMARY in recording.summaries]
-    figures = ([1e3 * hold["lpm"] for hold in holds], [hold["bar"] for hold in holds])
+    holds = [hold for recording in healthy if (hold := recording.summary(HoldSummary)) is not None]
+    figures = ([1e3 * hold.lpm for hold in holds], [hold.bar for hold in holds])
     ranges = [
         " to ".join(dict.fromkeys(f"{end:.3g}" for end in (min(values), max(values)))) for values in figures if holds
     ]
@@ -246,11 +247,10 @@ def summarise_machine(
         for name, value in recording.about.get("noise", {}).items():
             noises[name].append(value)
     noise = {name: float(np.median(values)) for name, values in noises.items()}
-    with_balance = [recording for recording in healthy if VOLUME_BALANCE in recording.summaries]
-    summaries: list[Summary] = []
-    for recording in with_balance:
-        summary = recording.summaries[VOLUME_BALANCE]
-        if not summaries or summary["terms"] == summaries[0]["terms"]:
+    with_balance = [recording for recording in healthy if BalanceSummary.method in recording.summaries]
+    summaries: list[BalanceSummary] = []
+    for recording, summary in zip(with_balance, _balance_summaries(with_balance), strict=True):
+        if not summaries or summary.terms == summaries[0].terms:
             summaries.append(summary)
         else:
             problems.append(f"{recording.file} has other channels than {with_balance[0].file}")
@@ -261,7 +261,9 @@ def summarise_machine(
     return MachineSummary(noise, smallest, problems)
 
 
-def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channels: frozenset[str]) -> SmallestLeak:
+def _smallest_leak(
+    balance: VolumeBalance, summaries: Sequence[BalanceSummary], channels: frozenset[str]
+) -> SmallestLeak:
     """Estimate the smallest leak that a recording of a later day will show if the machine moves and is loaded as usual.
 
     `balance` is the detector that made the `summaries` of the healthy recordings. Over these, a leak that is detected
@@ -279,9 +281,9 @@ def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channel
         rise = balance.predict_rise(summaries, channels, n_repeats)
         return float((rise.threshold(FALSE_ALARM_PROBABILITY) + ndtri(_PRIORS.power)) * rise.deviation)
 
-    pressure, flow, scale = (
-        float(np.median([summary[name] for summary in summaries])) for name in ("pressure", "flow", "scale")
-    )  # `scale`: factor from the balance's flows to the true ones, 0 if unknown
+    pressure = float(np.median([summary.pressure for summary in summaries]))
+    flow = float(np.median([summary.flow for summary in summaries]))
+    scale = float(np.median([summary.scale for summary in summaries]))
     smallest = smallest_rise(n_repeats=1)
     halved_by = next((n for n in _PRIORS.repeats if smallest_rise(n) <= 0.5 * smallest), None)
     share = smallest * pressure / flow if flow > 0.0 else float("nan")

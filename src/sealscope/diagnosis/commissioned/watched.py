@@ -12,11 +12,11 @@ from sealscope.diagnosis.commissioned.machine_file import read_machine
 from sealscope.diagnosis.estimate.linear import Gaussian
 from sealscope.diagnosis.healthy import SummarisedRecording
 from sealscope.diagnosis.inference.blocks import ColumnRoles
+from sealscope.diagnosis.inference.comparison.recording_sums import BalanceSummary
 from sealscope.diagnosis.inference.equations.balances import equations
 from sealscope.diagnosis.inference.equations.terms import PUMP
 from sealscope.diagnosis.live.estimates import HealthyLevel
 from sealscope.diagnosis.priors.inference import INFERENCE
-from sealscope.diagnosis.verdict.evidence import VOLUME_BALANCE
 from sealscope.diagnosis.verdict.machine_sizes import unstated_rig
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.parameters import Rig, load_rig
@@ -89,9 +89,9 @@ def _with_measured_displacement(rig: Rig, healthy: tuple[SummarisedRecording, ..
         return rig
     # a flow meter needs no displacement, and does not measure it
     by_pump = (recording for recording in healthy if flow_source(recording.units) not in METERS)
-    summaries = (recording.summaries.get(VOLUME_BALANCE, {}) for recording in by_pump)
+    summaries = (recording.summary(BalanceSummary) for recording in by_pump)
     # measured over assumed displacement, 0 if not measured
-    scales = [scale for summary in summaries if (scale := float(summary.get("scale", 0.0))) > 0.0]
+    scales = [summary.scale for summary in summaries if summary is not None and summary.scale > 0.0]
     if not scales:
         return rig
     source = f"measured by {len(scales)} healthy recordings beside the stated areas"
@@ -123,13 +123,13 @@ def _leak_conductance(recording: SummarisedRecording, rig: Rig) -> float | None:
     shows the piston alone and a stream shows nothing, if the summary has other terms than the rig's balance, or if the
     fit fails.
     """
-    summary, balances = recording.summaries.get(VOLUME_BALANCE), equations(rig, frozenset(recording.units))
+    summary, balances = recording.summary(BalanceSummary), equations(rig, frozenset(recording.units))
     if summary is None or len(balances) != 1 or rig.circuit.feeds_one_chamber:
         return None
-    if float(summary.get("held_odds", -np.inf)) > 0.0:
+    if summary.held_odds is not None and summary.held_odds > 0.0:
         return None
     roles = ColumnRoles(balances[0])
-    gram = np.asarray(summary["sums"], dtype=float)[0]  # Gram matrix of the only balance
+    gram = summary.sums[0]  # Gram matrix of the only balance
     n_columns = roles.left + 1  # the left side is the last column
     if gram.shape != (n_columns, n_columns):
         return None
@@ -138,6 +138,6 @@ def _leak_conductance(recording: SummarisedRecording, rig: Rig) -> float | None:
     columns = [*nuisance, roles.leak]
     *_, leak_coefficient = Gaussian.from_gram(gram).among(columns).mean
     # true over computed flow; 0 if it is unknown: the stream computes its flows with the same assumed sizes
-    scale = float(summary["scale"]) or 1.0
+    scale = summary.scale or 1.0
     conductance = float(leak_coefficient * scale)
     return conductance if np.isfinite(conductance) else None

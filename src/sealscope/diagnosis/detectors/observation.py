@@ -19,14 +19,13 @@ import numpy as np
 from sealscope.diagnosis.decision.case import step_key
 from sealscope.diagnosis.decision.null import HealthyNull, comparison_key, null_key
 from sealscope.diagnosis.detectors.registry import Detector, detectors, log_failure, unusable_reason, validate_report
-from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
+from sealscope.diagnosis.healthy import Healthy, healthy_summaries, keep_once, learn_once
 from sealscope.diagnosis.inference.changes.features import SIGNALS, observe_signals
 from sealscope.diagnosis.inference.changes.healthy_levels import HealthyLevels
 from sealscope.diagnosis.inference.hypotheses import Valves
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
-from sealscope.diagnosis.learnt import keep_once, learn_once
-from sealscope.diagnosis.rms_change.rms_detector import RmsChange, compare_summaries, has_same_rate
+from sealscope.diagnosis.rms_change.rms_detector import DetailSummary, RmsChange, compare_summaries, has_same_rate
 from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE, VOLUME_BALANCE
 from sealscope.parameters import Rig
 from sealscope.recordings.motion import describe_hold, describe_line
@@ -192,7 +191,8 @@ def healthy_null(baseline: Sequence[Healthy], rig: Rig, valves: Valves = Valves.
         for key, surprisal in surprisals.items():
             surprisals_by_key[key].append(surprisal)
     summaries = comparable_summaries(baseline)
-    comparisons = keep_once(("healthy comparisons", summaries), lambda: list(map(_rarest, compare_healthy(summaries))))
+    content = ("healthy comparisons", [summary.table() for summary in summaries])
+    comparisons = keep_once(content, lambda: list(map(_rarest, compare_healthy(summaries))))
     for rarest in comparisons:
         for data, surprisal in rarest.items():
             surprisals_by_key[comparison_key(data)].append(surprisal)
@@ -205,7 +205,7 @@ def _rarest(observables: Sequence[Observable]) -> dict[str, float]:
     return {observable.data: observable.surprisal for observable in ascending}
 
 
-def comparable_summaries(baseline: Sequence[Healthy]) -> list[Summary]:
+def comparable_summaries(baseline: Sequence[Healthy]) -> list[DetailSummary]:
     """Collect the summaries of the ringing of healthy recordings that can be compared with each other.
 
     Recordings with other chambers or another sampling rate than the first usable one are left out.
@@ -216,11 +216,11 @@ def comparable_summaries(baseline: Sequence[Healthy]) -> list[Summary]:
     return [
         summary
         for summary in summaries
-        if summary["chambers"] == summaries[0]["chambers"] and has_same_rate(summary["rate"], summaries[0]["rate"])
+        if summary.chambers == summaries[0].chambers and has_same_rate(summary.rate, summaries[0].rate)
     ]
 
 
-def compare_healthy(summaries: Sequence[Summary]) -> Iterator[Sequence[Observable]]:
+def compare_healthy(summaries: Sequence[DetailSummary]) -> Iterator[Sequence[Observable]]:
     """Compare the ringing of each healthy recording with that of all others, and yield the test results of each.
 
     `summaries`: those of recordings that can be compared; with fewer than `MIN_COMPARED` nothing is yielded.
@@ -228,5 +228,5 @@ def compare_healthy(summaries: Sequence[Summary]) -> Iterator[Sequence[Observabl
     if len(summaries) < MIN_COMPARED:
         return
     for k, summary in enumerate(summaries):
-        observables, _ = compare_summaries(summary, [*summaries[:k], *summaries[k + 1 :]], summary["chambers"])
+        observables, _ = compare_summaries(summary, [*summaries[:k], *summaries[k + 1 :]], summary.chambers)
         yield observables

@@ -10,12 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
 from sealscope.diagnosis.estimate.population import ScatterPrior, estimate_variance
-from sealscope.diagnosis.healthy import SummarisedRecording, Summary
+from sealscope.diagnosis.healthy import Magnitude, Number, Positive, SummarisedRecording, Summary
 from sealscope.diagnosis.hold.judgement import COOLING, format_estimate
 from sealscope.diagnosis.hold.result import HoldResult
 from sealscope.diagnosis.priors.trend import TREND
@@ -25,13 +25,22 @@ from sealscope.recordings.formats.times.timebase import parse_epoch
 from sealscope.storage.plain_values import convert_type, parse_json
 from sealscope.units import BAR
 
-#: Name of the summary of a healthy hold.
-HOLD_SUMMARY = "hold test"
 #: Next check where hold tests show a growing leak.
 SEPARATE_LEAKS = (
     "Look for oil outside: rod seal, fittings, hoses. If there is none, cap the port of the loaded side at the "
     "cylinder and hold again: if it sinks as before, the piston leaks, else the valve or its line."
 )
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class HoldSummary(Summary):
+    """Leak `lpm` of the longest healthy hold with half its 95 % interval `half_lpm` [L/min], at the pressure `bar`."""
+
+    method: ClassVar[str] = "hold test"
+
+    lpm: Number
+    half_lpm: Magnitude
+    bar: Positive
 
 
 class HeldGrowth(NamedTuple):
@@ -46,13 +55,13 @@ class HeldGrowth(NamedTuple):
     n_healthy: int
 
 
-def summarise_hold(holds: Sequence[HoldResult]) -> dict[str, float] | None:
+def summarise_hold(holds: Sequence[HoldResult]) -> HoldSummary | None:
     """Summarise the longest hold of a healthy recording for `estimate_growth`; None if its leak is unknown."""
     leakage = held_leakage(holds) if holds else None
     if leakage is None or leakage.lpm is None or leakage.interval_lpm is None or not leakage.pressure > 0.0:
         return None
     low, high = leakage.interval_lpm
-    return {"lpm": leakage.lpm, "half_lpm": 0.5 * (high - low), "bar": leakage.pressure / BAR}
+    return HoldSummary(lpm=leakage.lpm, half_lpm=0.5 * (high - low), bar=leakage.pressure / BAR)
 
 
 def date_hold(result: HoldResult) -> float | None:
@@ -69,12 +78,13 @@ def summarise_result(result: HoldResult) -> SummarisedRecording:
     summary, seconds = summarise_hold([result]), (result.end_s or 0.0) - (result.start_s or 0.0)
     if summary is None or not seconds > 0.0:
         raise InputError(f"a healthy hold test must state leak and pressure (--area), got neither ({result.file})")
-    digest = sha256(f"{result.start} {result.start_s} {summary}".encode()).hexdigest()
-    summaries = {HOLD_SUMMARY: summary}
+    table = summary.table()
+    digest = sha256(f"{result.start} {result.start_s} {table}".encode()).hexdigest()
+    summaries = {summary.method: table}
     return SummarisedRecording(result.file, digest, {}, 1.0 / seconds, seconds, date_hold(result), summaries)
 
 
-def estimate_growth(hold: Summary | None, healthy: Sequence[Summary]) -> HeldGrowth | None:
+def estimate_growth(hold: HoldSummary | None, healthy: Sequence[HoldSummary]) -> HeldGrowth | None:
     """Compare a hold with `healthy` ones (`summarise_hold`); None if a leak is unknown or the healthy ones have none.
 
     Leaks per pressure scatter between healthy tests, by their oil and loads (`between.hold_test` of a trend's priors):
@@ -82,8 +92,8 @@ def estimate_growth(hold: Summary | None, healthy: Sequence[Summary]) -> HeldGro
     """
     if hold is None or not healthy:
         return None
-    levels = np.array([entry["lpm"] / entry["bar"] for entry in healthy])
-    halves = np.array([entry["half_lpm"] / entry["bar"] for entry in healthy])
+    levels = np.array([entry.lpm / entry.bar for entry in healthy])
+    halves = np.array([entry.half_lpm / entry.bar for entry in healthy])
     from scipy.special import stdtrit
 
     n, usual, between = len(levels), float(levels.mean()), TREND.between
@@ -92,8 +102,8 @@ def estimate_growth(hold: Summary | None, healthy: Sequence[Summary]) -> HeldGro
     prior = ScatterPrior(between.hold_test * usual, between.freedom)
     variance, freedom = estimate_variance(float(((levels - usual) ** 2).sum()), n, prior)
     scatter = math.sqrt(variance * (1.0 + 1.0 / n))
-    half = math.hypot(float(stdtrit(freedom, 0.975)) * scatter, hold["half_lpm"] / hold["bar"])
-    level = hold["lpm"] / hold["bar"]
+    half = math.hypot(float(stdtrit(freedom, 0.975)) * scatter, hold.half_lpm / hold.bar)
+    level = hold.lpm / hold.bar
     return HeldGrowth(level / usual, (level - half) / usual, (level + half) / usual, n)
 
 

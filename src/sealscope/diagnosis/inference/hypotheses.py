@@ -24,12 +24,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import Enum
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.healthy import Summary
+from sealscope.diagnosis.healthy import Number, Values, stored_array
 from sealscope.diagnosis.inference.equations.feed import HoldCounts
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
@@ -95,6 +96,24 @@ FLOW_SIGN = Unknown(total_limit=float(np.log(1.0 / INFERENCE.sense.rewired - 1.0
 CREEP = Unknown(each_limit=INFERENCE.rest.single_odds_limit)
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RecordingOdds:
+    """Evidence of one recording for the unknowns of its machine, None where it tells nothing.
+
+    - `shut_odds`, `held_odds`: log odds that valves cut the resting pump off, from the leakage in all rests, and from
+      the leaks while the machine holds a load;
+    - `sign_log_odds` (E,): log odds of each balance that the recorded flow has the right sign;
+    - `creep_odds`: log odds that a held load creeps by leakage, if no pump's flow is recorded (`Flow.CREEP`);
+    - `holds` (2,): numbers of holds (`HoldCounts`).
+    """
+
+    shut_odds: Number | None = None
+    held_odds: Number | None = None
+    sign_log_odds: Values | None = None
+    creep_odds: Number | None = None
+    holds: Annotated[Array, stored_array(2)] | None = None
+
+
 class MachineOdds(NamedTuple):
     """Odds of a machine's unknowns before a recording of it is seen; by default those without healthy recordings.
 
@@ -110,18 +129,21 @@ class MachineOdds(NamedTuple):
     holds: HoldCounts | None = None
 
     @classmethod
-    def from_healthy(cls, summaries: Sequence[Summary], n_balances: int, scatter_log_odds: float = 0.0) -> MachineOdds:
-        """Add the evidence of healthy recordings, from their `summaries` (`VolumeBalance.learn`).
+    def from_healthy(
+        cls, recordings: Sequence[RecordingOdds], n_balances: int, scatter_log_odds: float = 0.0
+    ) -> MachineOdds:
+        """Add the evidence of healthy recordings.
 
         `n_balances`: number of balances E of the judged recording; healthy recordings with another number tell nothing
         of the signs. `scatter_log_odds`: log odds of shut valves by the scatter of the healthy leakages. The valves
         hold a load for certain if the mean log odds of all rests, or of the rests under load, exceed `rest.sure_odds`
         (`priors.toml`).
         """
-        by_rests, by_holds, signs, creep, holds = (
-            [summary[key] for summary in summaries if key in summary]
-            for key in ("shut_odds", "held_odds", "sign_log_odds", "creep_odds", "holds")
-        )
+        by_rests = [recording.shut_odds for recording in recordings if recording.shut_odds is not None]
+        by_holds = [recording.held_odds for recording in recordings if recording.held_odds is not None]
+        creep = [recording.creep_odds for recording in recordings if recording.creep_odds is not None]
+        signs = [recording.sign_log_odds for recording in recordings if recording.sign_log_odds is not None]
+        holds = [recording.holds for recording in recordings if recording.holds is not None]
         is_certain = any(odds and float(np.mean(odds)) > INFERENCE.rest.sure_odds for odds in (by_rests, by_holds))
         counts = np.sum([np.zeros(2), *holds], axis=0)
         return cls(

@@ -25,6 +25,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,10 +33,18 @@ from numpy.typing import NDArray
 from sealscope.diagnosis.estimate.change import Information, StepTest, step_tests
 from sealscope.diagnosis.estimate.interval import Interval
 from sealscope.diagnosis.estimate.population import Population, ScatterPrior, number_sessions
-from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
+from sealscope.diagnosis.healthy import (
+    MAX_LOGARITHM,
+    Healthy,
+    Positive,
+    Summary,
+    Texts,
+    Time,
+    Values,
+    healthy_summaries,
+)
 from sealscope.diagnosis.inference.comparison.rise import Rise, rise_of_mixture
 from sealscope.diagnosis.inference.observable import Observable, Observed, Ringing
-from sealscope.diagnosis.learnt import learn_once
 from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
 from sealscope.diagnosis.verdict.evidence import RMS_CHANGE
 from sealscope.recordings.channels import CHAMBERS, ROUNDING, chambers_of
@@ -334,10 +343,42 @@ def estimate_rises(
 DETAILS = "details"
 
 
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DetailSummary(Summary):
+    """Summary of a healthy recording by the RMS of its wavelet details (`RmsChange.learn`).
+
+    `chambers`: pressures of the `levels` (5 per chamber,), a row of `RmsBlocks.log_rms`; `recorded`: all recorded
+    chamber pressures; `rate`: sampling rate [Hz]; `start_s`: date [s since 1970]; `duty` (4,): the features `DUTY`.
+    """
+
+    method: ClassVar[str] = RMS_CHANGE
+
+    chambers: Texts
+    recorded: Texts
+    rate: Positive
+    start_s: Time | None = None
+    levels: Values
+    duty: Values
+
+    def check(self) -> None:
+        """Check shapes and logarithms; raise ValueError if they are not valid."""
+        expected = (len(QUANTITIES) * len(self.chambers),)
+        if not self.chambers or self.levels.shape != expected or self.duty.shape != (len(DUTY),):
+            shapes = f"{self.levels.shape} and {self.duty.shape}"
+            raise ValueError(f"levels and duty must be of the shapes {expected} and ({len(DUTY)},), got {shapes}")
+        if not max(np.abs(self.levels).max(), np.abs(self.duty).max()) < MAX_LOGARITHM:
+            raise ValueError(f"levels and duty must be logarithms with a magnitude below {MAX_LOGARITHM:g}")
+
+    def levels_of(self, chambers: Sequence[str]) -> Array:
+        """Select the log RMS of the wavelet details (5 per chamber,) of the given chambers."""
+        levels = self.levels.reshape(len(self.chambers), -1)
+        return np.concatenate([levels[self.chambers.index(chamber)] for chamber in chambers])
+
+
 class RmsChange:
     """Detector of changes of the wavelet details' RMS, within a recording or against leak-free recordings."""
 
-    name = RMS_CHANGE
+    name, summary_type = RMS_CHANGE, DetailSummary
 
     def __init__(self, rig: object = None) -> None:
         """Create the detector; `rig` is ignored, as the method needs no assumption on the machine."""
@@ -351,22 +392,17 @@ class RmsChange:
         frozen = next((name for name in chambers_of(recording) if is_constant(recording[name])), None)
         return None if frozen is None else f"{frozen} is constant"
 
-    def learn(self, recording: Recording) -> Summary:
+    def learn(self, recording: Recording) -> DetailSummary:
         """Summarise a healthy recording by the log RMS of its wavelet details, for comparison with later recordings."""
-        return learn_once(recording, (self.name, "summary"), self._summarise)
-
-    @staticmethod
-    def _summarise(recording: Recording) -> Summary:
-        """Compute the summary of a healthy recording (`learn`)."""
         levels, duty = measure_levels(recording)
-        return {
-            "chambers": list(judged_chambers(recording)),  # those of `levels`
-            "recorded": list(chambers_of(recording)),
-            "rate": recording.rate,
-            "start_s": start_seconds(recording),  # [s since 1970], None if unknown
-            "levels": levels,
-            "duty": duty,
-        }
+        return DetailSummary(
+            chambers=list(judged_chambers(recording)),
+            recorded=list(chambers_of(recording)),
+            rate=recording.rate,
+            start_s=start_seconds(recording),
+            levels=levels,
+            duty=duty,
+        )
 
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
         """Test the RMS of the wavelet details against `baseline` or, without one, for a change within the recording."""
@@ -435,16 +471,16 @@ def observe_against(recording: Recording, baseline: Sequence[Healthy]) -> Observ
     comparable = [
         summary
         for summary in healthy_summaries(RmsChange(), baseline)
-        if summary["recorded"] == recorded and has_same_rate(summary["rate"], recording.rate)
+        if summary.recorded == recorded and has_same_rate(summary.rate, recording.rate)
     ]
-    summaries = [summary for summary in comparable if set(chambers) <= set(summary["chambers"])]
+    summaries = [summary for summary in comparable if set(chambers) <= set(summary.chambers)]
     if not summaries:
         kind = f"the same chambers at {recording.rate:g} Hz"
         clipped = f"{' or '.join(chambers)} is mostly clipped in every baseline recording with {kind}"
         return Observed(RmsChange.name, lack=clipped if comparable else f"no baseline recording has {kind}")
-    judged = RmsChange().learn(recording)
+    (judged,) = healthy_summaries(RmsChange(), [recording])  # computed once
     observables, bound = compare_summaries(judged, summaries, chambers)
-    is_dated = None not in [summary.get("start_s") for summary in (judged, *summaries)]
+    is_dated = None not in [summary.start_s for summary in (judged, *summaries)]
     ringing = Ringing(bound, recording.rate, len(summaries), is_dated, recording.unused)
     return Observed(RmsChange.name, observables, ringing=ringing)
 
@@ -455,7 +491,7 @@ def has_same_rate(rate: float, other: float) -> bool:
 
 
 def compare_summaries(
-    judged: Summary, summaries: Sequence[Summary], chambers: Sequence[str]
+    judged: DetailSummary, summaries: Sequence[DetailSummary], chambers: Sequence[str]
 ) -> tuple[tuple[Observable, ...], float]:
     """Test the RMS of every chamber pressure's wavelet details for a rise or fall against leak-free recordings.
 
@@ -464,14 +500,13 @@ def compare_summaries(
     an undetected change g of the ringing (log RMS without noise): the smallest of those by the judged details d2 to d4,
     which all contain the ringing.
     """
-    starts = [*(summary.get("start_s") for summary in summaries), judged.get("start_s")]
+    starts = [summary.start_s for summary in (*summaries, judged)]
     times = None if None in starts else np.array(starts, dtype=float)
-    duties = np.array([summary["duty"] for summary in summaries], dtype=float)
-    levels = np.array([_summary_levels(summary, chambers) for summary in summaries])
-    judged_levels, judged_duty = _summary_levels(judged, chambers), np.asarray(judged["duty"], dtype=float)
+    duties = np.array([summary.duty for summary in summaries])
+    levels = np.array([summary.levels_of(chambers) for summary in summaries])
     observables, bounds = list[Observable](), list[float]()
     # changes g of the ringing, and fractions of energy that is not noise
-    rises, weights = estimate_rises(judged_levels, judged_duty, levels, duties, times)
+    rises, weights = estimate_rises(judged.levels_of(chambers), judged.duty, levels, duties, times)
     for name, rise, weight in zip(column_names(chambers), rises, weights, strict=True):
         change = rise._replace(value=abs(rise.value))  # a fall is tested like a rise of the same size
         score = 2.0 * change.log_ratio(change.value)
@@ -503,9 +538,3 @@ def _make_observable(
         onset=onset,
         size=size,
     )
-
-
-def _summary_levels(summary: Summary, chambers: Sequence[str]) -> Array:
-    """Select the log RMS of the wavelet details (5 per chamber,) of the given chambers from a recording's summary."""
-    levels = np.asarray(summary["levels"], dtype=float).reshape(len(summary["chambers"]), -1)
-    return np.concatenate([levels[summary["chambers"].index(chamber)] for chamber in chambers])

@@ -16,7 +16,7 @@ from sealscope.diagnosis.assumed_rig import assumed_rig
 from sealscope.diagnosis.detectors.observation import limit_threads
 from sealscope.diagnosis.detectors.registry import unusable_reason
 from sealscope.diagnosis.estimate.interval import WITHIN_95
-from sealscope.diagnosis.healthy import Summary
+from sealscope.diagnosis.healthy import healthy_summaries
 from sealscope.diagnosis.hold.hold_test import judge_held_recording
 from sealscope.diagnosis.hold.recorded_holds import date_hold, held_leakage
 from sealscope.diagnosis.hold.result import HoldResult
@@ -30,7 +30,7 @@ from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.inspection import inspect_recording
 from sealscope.diagnosis.priors.pressures import PRESSURE
 from sealscope.diagnosis.priors.trend import TREND
-from sealscope.diagnosis.rms_change.rms_detector import JUDGED, RmsChange, measure_levels
+from sealscope.diagnosis.rms_change.rms_detector import JUDGED, DetailSummary, RmsChange, measure_levels
 from sealscope.diagnosis.trend.wear import ScatterPrior
 from sealscope.diagnosis.verdict.machine_sizes import AssumedMachine
 from sealscope.errors import InputError
@@ -75,7 +75,7 @@ class LeakReading:
     size_error: float = 0.0  # relative standard error of flows due to the machine's sizes (displacement, piston area)
     sums: RecordingSums | None = None  # sums of the volume balance
     terms: tuple[ColumnRoles, ...] = ()  # roles of its columns, one entry for each equation
-    ringing: Summary | None = None  # summary of the pressures' ringing (RMS of their wavelet details)
+    ringing: DetailSummary | None = None  # summary of the pressures' ringing (RMS of their wavelet details)
 
 
 def estimate_reading(
@@ -120,7 +120,8 @@ def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[
     """
     balance, response, details = VolumeBalance(rig), PressureResponse(rig), RmsChange()
     balance_lack, response_lack = unusable_reason(balance, part), unusable_reason(response, part)
-    fields: dict[str, Any] = {"ringing": details.learn(part) if unusable_reason(details, part) is None else None}
+    ringing = healthy_summaries(details, [part] if unusable_reason(details, part) is None else [])
+    fields: dict[str, Any] = {"ringing": ringing[0] if ringing else None}
     solution = balance.balance(part) if balance_lack is None else None
     if solution is not None and solution.flow is not Flow.VALVE:  # several balances have no common leak
         return fields | _balance_fields(solution, machine)

@@ -11,6 +11,7 @@ onset, and of the ringing (RMS of the pressures' wavelet details) in the last re
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -171,7 +172,7 @@ def _rival_changes(
     pressure = float(np.mean([sums.pressure for sums in sums_since]))
     # all recordings since the onset as one; leaks in holds (`held`) are not compared
     judged = RecordingSums(np.sum([sums.sums for sums in sums_since], axis=0), flow, pressure, held=None)
-    healthy = [sums._replace(held=None) for sums in sums_before]
+    healthy = [replace(sums, held=None) for sums in sums_before]
     return rival_rises(judged, healthy, last.terms)
 
 
@@ -185,12 +186,12 @@ def _report_rms_change(last: TrendPoint, before: Sequence[TrendPoint]) -> Observ
     observables: tuple[Observable, ...] = ()
     if judged is not None and last.basis != "ringing":
         healthy = [
-            point.ringing
+            ringing
             for point in before
-            if point.ringing is not None
-            and all(point.ringing[name] == judged[name] for name in ("chambers", "recorded"))
-            and has_same_rate(point.ringing["rate"], judged["rate"])
+            if (ringing := point.ringing) is not None
+            and (ringing.chambers, ringing.recorded) == (judged.chambers, judged.recorded)
+            and has_same_rate(ringing.rate, judged.rate)
         ]
         if healthy:
-            observables, _ = compare_summaries(judged, healthy, judged["chambers"])
+            observables, _ = compare_summaries(judged, healthy, judged.chambers)
     return Observed(RMS_CHANGE, observables)

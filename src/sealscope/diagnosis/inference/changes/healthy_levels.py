@@ -15,14 +15,15 @@ recordings with both chamber pressures.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import numpy as np
 
 from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.estimate.population import ScatterPrior
-from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
+from sealscope.diagnosis.healthy import MAX_LOGARITHM, Healthy, Magnitude, Number, Summary, Values, healthy_summaries
 from sealscope.diagnosis.inference.changes.charge_pressure import (
     DRIFT,
     PUMP,
@@ -38,11 +39,16 @@ from sealscope.diagnosis.inference.changes.motion_fit import (
     fit_robustly,
     select_motion,
 )
-from sealscope.diagnosis.inference.changes.pressure_bands import PAIRS, Octaves, compare_spectra, compute_all_octaves
+from sealscope.diagnosis.inference.changes.pressure_bands import (
+    MIN_OCTAVES,
+    PAIRS,
+    Octaves,
+    compare_spectra,
+    compute_all_octaves,
+)
 from sealscope.diagnosis.inference.equations.signals import Signals
 from sealscope.diagnosis.inference.machine_states import MIN_REST, flag_lowering, number_strokes, rest_limit
 from sealscope.diagnosis.inference.observable import Observable, compare_estimates
-from sealscope.diagnosis.learnt import learn_once
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.channels import CHAMBERS, flow_source
 from sealscope.recordings.recording import Array, Recording
@@ -50,30 +56,132 @@ from sealscope.signals.smoothing import TINY
 
 #: Names of the observables: of friction, and of drifts, which are rival descriptions of the same data.
 FRICTION, DRIFTS = "friction", ("drift of p_A", "drift of p_B", "drift of both")
-#: Kinds of drifts of p_A and p_B in a recording's summary: in motion, and of the lowest readings.
-MOTION, LOW = "drift", "low"
-#: Keys of the drifts, and of their standard errors.
-DRIFT_KEYS = tuple(f"{kind}_{side}{suffix}" for kind in (MOTION, LOW) for side in "AB" for suffix in ("", "_error"))
-#: Name of the observable of the zeros of both sensors, and keys of p_A - p_B of connected chambers and of its error.
-ZEROS, ZERO_KEYS = "drift of p_A - p_B", ("connected_difference", "connected_difference_error")
+#: Name of the observable of the zeros of both sensors.
+ZEROS = "drift of p_A - p_B"
 #: Quantile, over healthy recordings, of the size of a friction of the wrong sign over its error (`_compare_friction`).
 UPPER_QUARTILE = 0.75
-#: Keys of the friction and of its standard error in a recording's summary.
-FRICTION_KEYS = ("friction_pressure", "friction_error")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LevelSummary(Summary):
+    """Friction, drifts and spectra of a healthy recording (`HealthyLevels.learn`), with standard errors.
+
+    - `friction_pressure`: friction as a pressure difference [Pa];
+    - `drift_A`, `drift_B`: drifts of the pressures in motion [Pa over the recording]; `low_A`, `low_B`: those of the
+      lowest readings;
+    - `connected_difference`: p_A - p_B of connected chambers [Pa];
+    - `octaves` and the like (4, k): the fields of `Octaves` in k octaves, for each pair of channels in `PAIRS`.
+    """
+
+    method: ClassVar[str] = SIGNALS
+
+    friction_pressure: Number | None = None
+    friction_error: Magnitude | None = None
+    drift_A: Number | None = None
+    drift_A_error: Magnitude | None = None
+    drift_B: Number | None = None
+    drift_B_error: Magnitude | None = None
+    low_A: Number | None = None
+    low_A_error: Magnitude | None = None
+    low_B: Number | None = None
+    low_B_error: Magnitude | None = None
+    connected_difference: Number | None = None
+    connected_difference_error: Magnitude | None = None
+    octaves: Values | None = None
+    octaves_A_x: Values | None = None
+    octaves_B_x: Values | None = None
+    octaves_A_omega: Values | None = None
+    octaves_B_omega: Values | None = None
+
+    @property
+    def friction(self) -> Estimate | None:
+        """Friction as a pressure difference [Pa]."""
+        return _known_estimates(friction=(self.friction_pressure, self.friction_error)).get("friction")
+
+    @property
+    def zero(self) -> Estimate | None:
+        """Pressure difference p_A - p_B of connected chambers [Pa]."""
+        return _known_estimates(zero=(self.connected_difference, self.connected_difference_error)).get("zero")
+
+    @property
+    def drifts(self) -> dict[str, Estimate]:
+        """Known drifts of p_A and p_B in motion, by "A" and "B"."""
+        return _known_estimates(A=(self.drift_A, self.drift_A_error), B=(self.drift_B, self.drift_B_error))
+
+    @property
+    def low_drifts(self) -> dict[str, Estimate]:
+        """Known drifts of the lowest readings of p_A and p_B, by "A" and "B"."""
+        return _known_estimates(A=(self.low_A, self.low_A_error), B=(self.low_B, self.low_B_error))
+
+    @property
+    def spectra(self) -> dict[str, Octaves]:
+        """Known spectra of pairs of channels, by their names in `PAIRS`."""
+        return {name: Octaves(*values) for name in PAIRS if (values := getattr(self, name)) is not None}
+
+    def check(self) -> None:
+        """Check the spectra; raise ValueError if they are not valid."""
+        for name in PAIRS:
+            if (values := getattr(self, name)) is None:
+                continue
+            if values.ndim != 2 or len(values) != len(Octaves._fields) or values.shape[1] < MIN_OCTAVES:
+                shape = f"({len(Octaves._fields)}, k), k >= {MIN_OCTAVES}"
+                raise ValueError(f"{name} must be of the shape {shape}, got {values.shape}")
+            if not np.abs(values).max() < MAX_LOGARITHM or (values[-1] < 0.0).any():
+                rule = f"must hold logarithms, phases and variances below {MAX_LOGARITHM:g} in magnitude"
+                raise ValueError(f"{name} {rule}")
+
+
+def _known_estimates(**pairs: tuple[float | None, float | None]) -> dict[str, Estimate]:
+    """Join values and their standard errors by name, as far as both are known."""
+    known = {name: (value, error) for name, (value, error) in pairs.items() if value is not None and error is not None}
+    return {name: Estimate(value, error) for name, (value, error) in known.items()}
 
 
 class HealthyLevels:
     """Comparison of a recording's friction, drifts and spectra with those of healthy recordings."""
 
-    name = SIGNALS
+    name, summary_type = SIGNALS, LevelSummary
 
-    def learn(self, recording: Recording) -> Summary | None:
-        """Summarise a recording by friction, drifts and spectra; None if nothing can be estimated.
-
-        The summary maps names to numbers, such as "friction_pressure" [Pa], and each name in `PAIRS` (a pair of
-        channels) to an array (4, k) with the fields of `Octaves` in k octaves. Unknown entries are missing.
-        """
-        return learn_once(recording, ("healthy levels",), _estimate_levels)
+    @np.errstate(all="ignore")
+    def learn(self, recording: Recording) -> LevelSummary | None:
+        """Summarise a recording by friction, drifts and spectra; None if nothing can be estimated."""
+        nothing = (None, None)
+        fit, motion, drifts, zero = fit_difference(recording), select_motion(recording), dict[str, Estimate](), None
+        if motion is not None:
+            # residuals may be correlated within a stroke
+            drifts = {
+                side: fit_robustly(motion.design, recording[f"p_{side}"][motion.rows], [TIME], motion.strokes)[0]
+                for side in "AB"
+            }
+        flow_channel = flow_source(recording.channels)
+        if flow_channel in PUMP and {"x", *CHAMBERS} <= set(recording.channels):
+            zero = estimate_connected_difference(recording, turned_angle(recording, flow_channel))
+        if not np.isfinite([*drifts.values()]).all():
+            drifts = {}
+        if zero is not None and not np.isfinite(zero).all():
+            zero = None
+        low_drifts = estimate_low_drifts(recording)
+        drift_A, drift_B, low_A, low_B = (
+            estimates.get(side, nothing) for estimates in (drifts, low_drifts) for side in "AB"
+        )
+        summary = LevelSummary(
+            friction_pressure=None if fit is None else fit.friction,
+            friction_error=None if fit is None else fit.friction_error,
+            drift_A=drift_A[0],
+            drift_A_error=drift_A[1],
+            drift_B=drift_B[0],
+            drift_B_error=drift_B[1],
+            low_A=low_A[0],
+            low_A_error=low_A[1],
+            low_B=low_B[0],
+            low_B_error=low_B[1],
+            connected_difference=None if zero is None else zero.value,
+            connected_difference_error=None if zero is None else zero.deviation,
+        )
+        all_octaves = zip(PAIRS, compute_all_octaves(recording, list(PAIRS.values())), strict=True)
+        spectra: dict[str, Any] = {name: np.stack(octaves) for name, octaves in all_octaves if octaves is not None}
+        summary = replace(summary, **spectra)
+        return summary if summary.table() else None
 
     def compare(self, recording: Recording, baseline: Sequence[Healthy]) -> Iterator[Observable]:
         """Compare friction, spectra and drifts of the pressures with those of the healthy recordings in `baseline`.
@@ -81,37 +189,19 @@ class HealthyLevels:
         There are two kinds of drift, of the mean pressures during motion and of the lowest readings. A quantity that is
         missing in the recording or in too many healthy ones has no test.
         """
-        judged = self.learn(recording)
-        if judged is None:
-            return
-        healthy = healthy_summaries(self, baseline)
-        yield from compare_low_drifts(_read_drifts(judged, LOW), [_read_drifts(summary, LOW) for summary in healthy])
-        healthy_spectra = [_read_octaves(summary) for summary in healthy]
-        if (spectra := compare_spectra(_read_octaves(judged), healthy_spectra)) is not None:
-            yield spectra
-        if (friction := _compare_friction(judged, healthy)) is not None:
-            yield friction
-        yield from _compare_drifts(judged, healthy, recording.duration)
-        if (zeros := _compare_zeros(judged, healthy)) is not None:
-            yield zeros
+        for judged in healthy_summaries(self, [recording]):
+            healthy = healthy_summaries(self, baseline)
+            yield from compare_low_drifts(judged.low_drifts, [summary.low_drifts for summary in healthy])
+            if (spectra := compare_spectra(judged.spectra, [summary.spectra for summary in healthy])) is not None:
+                yield spectra
+            if (friction := _compare_friction(judged, healthy)) is not None:
+                yield friction
+            yield from _compare_drifts(judged, healthy, recording.duration)
+            if (zeros := _compare_zeros(judged, healthy)) is not None:
+                yield zeros
 
 
-def _read_octaves(summary: Summary) -> dict[str, Octaves]:
-    """Read the spectra of all pairs of channels in a recording's summary, by the names of the pairs in `PAIRS`."""
-    return {name: Octaves(*np.asarray(summary[name], dtype=float)) for name in PAIRS if name in summary}
-
-
-def _read_drifts(summary: Summary, kind: str) -> dict[str, Estimate]:
-    """Read the known drifts of p_A and p_B, by "A" and "B", from a recording's summary; `kind`: `MOTION` or `LOW`."""
-    keys = {side: (f"{kind}_{side}", f"{kind}_{side}_error") for side in "AB"}
-    return {
-        side: Estimate(float(summary[key]), float(summary[error_key]))
-        for side, (key, error_key) in keys.items()
-        if {key, error_key} <= set(summary)
-    }
-
-
-def _compare_friction(judged: Summary, healthy: Sequence[Summary]) -> Observable | None:
+def _compare_friction(judged: LevelSummary, healthy: Sequence[LevelSummary]) -> Observable | None:
     """Test whether the friction of a recording, as a pressure difference, is higher than in healthy recordings.
 
     The logarithms of the friction are compared. Return None if the judged friction is not usable, or fewer than
@@ -125,31 +215,30 @@ def _compare_friction(judged: Summary, healthy: Sequence[Summary]) -> Observable
       quadrature.
     - A friction is usable if it has the right sign and exceeds its error.
     """
-    key, error_key = FRICTION_KEYS
     prior = CHANGES.healthy
-    known = [summary for summary in healthy if set(FRICTION_KEYS) <= set(summary)]
-    if not known or not set(FRICTION_KEYS) <= set(judged):
+    known = [friction for summary in healthy if (friction := summary.friction) is not None]
+    if not known or judged.friction is None:
         return None
-    ratios = np.array([float(summary[key]) / max(float(summary[error_key]), TINY) for summary in known])
+    ratios = np.array([pressure / max(error, TINY) for pressure, error in known])
     sign = float(np.sign(ratios.sum()))
     inflation = max(1.0, float(np.quantile(np.maximum(-sign * ratios, 0.0), UPPER_QUARTILE)))
 
-    def log_friction(summary: Summary) -> Estimate | None:
+    def log_friction(friction: Estimate) -> Estimate | None:
         """Return the logarithm of a recording's friction, or None if it is not usable."""
-        pressure, error = sign * float(summary[key]), inflation * float(summary[error_key])
+        pressure, error = sign * friction.value, inflation * friction.deviation
         if not pressure > error:
             return None
         return Estimate(float(np.log(pressure)), float(np.hypot(prior.friction_error, error / pressure)))
 
-    healthy_logs = [friction for summary in known if (friction := log_friction(summary)) is not None]
-    judged_log = log_friction(judged)
+    healthy_logs = [logarithm for friction in known if (logarithm := log_friction(friction)) is not None]
+    judged_log = log_friction(judged.friction)
     if judged_log is None:
         return None
     scatter = ScatterPrior(deviation=prior.friction_scatter, recordings=prior.recordings)
     return compare_estimates(FRICTION, FRICTION, judged_log, healthy_logs, scatter, above=True)
 
 
-def _compare_drifts(judged: Summary, healthy: Sequence[Summary], duration: float) -> Iterator[Observable]:
+def _compare_drifts(judged: LevelSummary, healthy: Sequence[LevelSummary], duration: float) -> Iterator[Observable]:
     """Compare the drifts of p_A and p_B during motion [Pa over the recording] with those of healthy recordings.
 
     `duration` [s]: that of the judged recording. Yields a test for each of three alternative explanations: p_A drifts,
@@ -161,10 +250,10 @@ def _compare_drifts(judged: Summary, healthy: Sequence[Summary], duration: float
     A score is the square of a z score. With equal errors of both drifts, z_A^2 + z_B^2 = z_mean^2 + z_difference^2, so
     that what remains is the score of their mean; a p-value is about exp(-z^2 / 2).
     """
-    judged_drifts = _read_drifts(judged, MOTION)
+    judged_drifts = judged.drifts
     if len(judged_drifts) < 2:
         return
-    healthy_drifts = [drifts for summary in healthy if len(drifts := _read_drifts(summary, MOTION)) > 1]
+    healthy_drifts = [drifts for summary in healthy if len(drifts := summary.drifts) > 1]
     prior = CHANGES.healthy
     scatter = ScatterPrior(prior.drift, recordings=prior.drift_recordings, inflation=prior.drift_inflation)
     drift_A, drift_B = (
@@ -183,49 +272,14 @@ def _compare_drifts(judged: Summary, healthy: Sequence[Summary], duration: float
     yield replace(difference, chance=min(chance, 1.0), score=score)
 
 
-def _compare_zeros(judged: Summary, healthy: Sequence[Summary]) -> Observable | None:
+def _compare_zeros(judged: LevelSummary, healthy: Sequence[LevelSummary]) -> Observable | None:
     """Compare p_A - p_B of connected chambers with that of healthy recordings; None if it is missing in too many."""
-    if not set(ZERO_KEYS) <= set(judged):
+    if judged.zero is None:
         return None
-    judged_zero, *healthy_zeros = (
-        Estimate(*(float(summary[key]) for key in ZERO_KEYS))
-        for summary in (judged, *healthy)
-        if set(ZERO_KEYS) <= set(summary)
-    )
+    healthy_zeros = [zero for summary in healthy if (zero := summary.zero) is not None]
     prior = CHANGES.healthy
     scatter = ScatterPrior(prior.drift, recordings=prior.drift_recordings, inflation=prior.drift_inflation)
-    return compare_estimates(ZEROS, DRIFT, judged_zero, healthy_zeros, scatter)
-
-
-@np.errstate(all="ignore")
-def _estimate_levels(recording: Recording) -> Summary | None:
-    """Estimate friction, drifts and spectra of a recording (`HealthyLevels.learn`); None if none can be estimated."""
-    levels = dict[str, float]()
-    if (fit := fit_difference(recording)) is not None:
-        levels |= dict(zip(FRICTION_KEYS, (fit.friction, fit.friction_error), strict=True))
-    if (motion := select_motion(recording)) is not None:
-        # residuals may be correlated within a stroke
-        drifts = {
-            side: fit_robustly(motion.design, recording[f"p_{side}"][motion.rows], [TIME], motion.strokes)[0]
-            for side in "AB"
-        }
-        if np.isfinite([*drifts.values()]).all():
-            levels |= _list_drifts(drifts, MOTION)
-    levels |= _list_drifts(estimate_low_drifts(recording), LOW)
-    flow_channel = flow_source(recording.channels)
-    if flow_channel in PUMP and {"x", *CHAMBERS} <= set(recording.channels):
-        difference = estimate_connected_difference(recording, turned_angle(recording, flow_channel))
-        if difference is not None and np.isfinite(difference).all():
-            levels |= dict(zip(ZERO_KEYS, difference, strict=True))
-    all_octaves = zip(PAIRS, compute_all_octaves(recording, list(PAIRS.values())), strict=True)
-    spectra = {name: np.stack(octaves) for name, octaves in all_octaves if octaves is not None}
-    return {**levels, **spectra} or None
-
-
-def _list_drifts(drifts: Mapping[str, Estimate], kind: str) -> dict[str, float]:
-    """List drifts and their standard errors for a recording's summary, from which `_read_drifts` reads them."""
-    values = {f"{kind}_{side}": drift.value for side, drift in drifts.items()}
-    return values | {f"{kind}_{side}_error": drift.deviation for side, drift in drifts.items()}
+    return compare_estimates(ZEROS, DRIFT, judged.zero, healthy_zeros, scatter)
 
 
 #: Minimum number of strokes in either direction, for a standard error.

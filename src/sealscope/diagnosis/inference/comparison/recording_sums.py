@@ -12,16 +12,32 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 
 from sealscope.diagnosis.estimate.linear import Gaussian, limit_precisions, solve
+from sealscope.diagnosis.healthy import (
+    MAX_NUMBER,
+    Magnitude,
+    Number,
+    Summary,
+    Texts,
+    Time,
+    Values,
+    stored_array,
+)
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, sum_blocks
 from sealscope.diagnosis.inference.equations.terms import LAG, LEAK
+from sealscope.diagnosis.inference.hypotheses import RecordingOdds
 from sealscope.diagnosis.priors.inference import INFERENCE
+from sealscope.diagnosis.verdict.evidence import VOLUME_BALANCE
 from sealscope.recordings.recording import Array
 from sealscope.signals.smoothing import TINY
+
+#: Largest ratio of a squared sum of products to the product of the sums of squares: 1 (Cauchy), plus rounding errors.
+_ROUNDING = 1.0 + 1e-6
 
 
 class Resistance(NamedTuple):
@@ -39,8 +55,9 @@ class Resistance(NamedTuple):
     top_speed: float
 
 
-class RecordingSums(NamedTuple):
-    """Summary of one recording, for the comparison with other recordings of the same machine.
+@dataclass(frozen=True, eq=False)
+class RecordingSums:
+    """Sums of one recording, for the comparison with other recordings of the same machine.
 
     - `sums` (E, m, m): Gram matrix of the m columns of each of E equations, divided by the residual variance of a row,
       with the coefficients eliminated that recordings do not share (`eliminate_unshared`);
@@ -51,14 +68,14 @@ class RecordingSums(NamedTuple):
     - `resistance` (5,): what resists the motion (`Resistance`), or None.
     """
 
-    sums: Array
-    flow: float
-    pressure: float
-    start_s: float | None = None
-    oil_degC: float | None = None
-    held: Array | None = None
-    held_pump: Array | None = None
-    resistance: Array | None = None
+    sums: Values
+    flow: Magnitude
+    pressure: Magnitude
+    start_s: Time | None = None
+    oil_degC: Number | None = None
+    held: Annotated[Array, stored_array(6)] | None = None
+    held_pump: Annotated[Array, stored_array(2)] | None = None
+    resistance: Annotated[Array, stored_array(5)] | None = None
 
     @classmethod
     def from_blocks(
@@ -76,6 +93,55 @@ class RecordingSums(NamedTuple):
     def conductance_of_flow(self) -> float:
         """Conductance [m^3/(s Pa)] of a leak as large as the pump's mean flow; 0 if the mean pressure is 0."""
         return self.flow / self.pressure if self.pressure > 0.0 else 0.0
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class BalanceSummary(RecordingSums, RecordingOdds, Summary):
+    """Summary of a healthy recording by the volume balance (`VolumeBalance.learn`).
+
+    A single recording may leave open whether valves cut the pump off from the cylinder while it rests. The summary
+    therefore has Gram matrices for both cases, and log odds, which are later combined over all healthy recordings:
+
+    - the sums of a recording whose pump stays connected at rest, and its evidence for the machine's unknowns;
+    - `terms`: names of the balance's terms, the columns of `sums` but the last;
+    - `scale`: factor from computed to true flows (`Size`), 0 if no flow can be stated in L/min;
+    - `delivered`: mean flow of the pump in motion [m^3/s], as computed with the assumed sizes;
+    - `stroke` (2,): ends of the recorded motion [m], None without a position;
+    - `shut_sums` (1, m + 2, m + 2): Gram matrix for a pump that valves cut off at rest, which needs two more columns;
+      None if the machine never rests.
+    """
+
+    method: ClassVar[str] = VOLUME_BALANCE
+
+    terms: Texts
+    scale: Magnitude
+    delivered: Number = 0.0
+    stroke: Annotated[Array, stored_array(2)] | None = None
+    shut_sums: Values | None = None
+
+    def check(self) -> None:
+        """Check shapes, terms and sums; raise ValueError if they do not fit.
+
+        Leak and left side must have positive sums of squares, and obey Cauchy's inequality.
+        """
+        size, shut = len(self.terms) + 1, self.shut_sums
+        if self.sums.ndim != 3 or not len(self.sums) or self.sums.shape[1:] != (size, size):
+            raise ValueError(f"sums must be of the shape (E, {size}, {size}), got {self.sums.shape}")
+        if shut is not None and shut.shape != (1, size + 2, size + 2):
+            raise ValueError(f"shut_sums must be of the shape (1, {size + 2}, {size + 2}), got {shut.shape}")
+        if self.stroke is not None and self.stroke[0] > self.stroke[1]:
+            raise ValueError(f"stroke must hold the lower and the upper end of the motion, got {self.stroke}")
+        if self.resistance is not None:
+            fit = Resistance(*self.resistance)
+            if min(fit.friction_error, fit.drop_error, fit.top_speed) < 1.0 / MAX_NUMBER:  # these are divisors
+                raise ValueError("resistance must hold positive standard errors and a positive speed")
+        if LEAK not in self.terms:
+            raise ValueError(f"terms must include {LEAK!r}, got {', '.join(self.terms)}")
+        leak = self.terms.index(LEAK)
+        squares = self.sums[:, [leak, -1], [leak, -1]]  # (E, 2): sums of squares of leak and left side
+        product = self.sums[:, leak, -1]
+        if not (squares > 0.0).all() or not (product**2 <= _ROUNDING * squares.prod(axis=1)).all():
+            raise ValueError("sums must be sums of squares and products of a leak and a flow, got other numbers")
 
 
 class ComparedColumns(Protocol):

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sealscope.diagnosis.estimate.change import Information, StepTest, fit_history, step_test
 from sealscope.diagnosis.estimate.interval import WITHIN_95, Estimate
 from sealscope.diagnosis.inference.comparison.levels import rise
-from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.equations.terms import LEAK
 from sealscope.diagnosis.inference.observable import UNKNOWN_FLOW, LeakMeasure, LeakRise
 from sealscope.diagnosis.inference.pressures.fit import Priors
 from sealscope.diagnosis.inference.pressures.reduced_rig import PARAMETERS, G
+from sealscope.diagnosis.inference.pressures.samples import ResponseSummary
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.priors.pressures import PRESSURE
 from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE, Cause, LeakCourse, TotalLeakage
@@ -45,21 +46,6 @@ def states_flow(rig: Rig) -> bool:
     return rig.states("cylinder.A_A", "cylinder.A_B", "cylinder.M_eq")
 
 
-class HealthyResponse(NamedTuple):
-    """A healthy recording: its law of friction (`reduced_rig.LAWS`), and the likelihood of its parameters.
-
-    `recording.sums` (1, p + 1, p + 1): that of the parameters' averages over the recording (`fit.Joint.sums`).
-    """
-
-    law: str
-    recording: RecordingSums
-
-    @property
-    def sums(self) -> Array:
-        """Likelihood of the parameters' averages over the recording, as a Gram matrix (p + 1, p + 1)."""
-        return np.asarray(self.recording.sums[0])
-
-
 class ResponseColumns:
     """Columns of the Gram matrices of p parameters and the left side (`fit.Joint.sums`), as `coefficients` reads them.
 
@@ -83,8 +69,8 @@ class ResponseLeak(LeakMeasure):
     - `parameters`: likelihood in K blocks of each parameter of the response, by the parameter's name; "G" is the
       conductance past the piston [m^3/(s Pa)].
     - `pressure` (K,): mean of abs(p_A - p_B) in each block [Pa].
-    - `conditions`: summary of the recording, with the likelihood of its parameters (`HealthyResponse`).
-    - `law`, `priors`: law of friction, and priors of the rig's parameters.
+    - `conditions`: summary of the recording, with its law of friction and the likelihood of its parameters.
+    - `priors`: priors of the rig's parameters.
     - `stated`: true if the rig's file states the sizes that convert a conductance to L/min.
     - `healthy`: healthy recordings of the machine with this law of friction.
 
@@ -101,15 +87,14 @@ class ResponseLeak(LeakMeasure):
         self,
         parameters: Mapping[str, Information],
         pressure: Array,
-        conditions: RecordingSums,
+        conditions: ResponseSummary,
         *,
-        law: str,
         priors: Priors,
         stated: bool,
-        healthy: Sequence[HealthyResponse] = (),
+        healthy: Sequence[ResponseSummary] = (),
     ) -> None:
         self.parameters, self.pressure, self.conditions = parameters, pressure, conditions
-        self.law, self.priors, self.stated, self.healthy = law, priors, stated, healthy
+        self.priors, self.stated, self.healthy = priors, stated, healthy
 
     @property
     def information(self) -> Information:
@@ -160,7 +145,7 @@ class ResponseLeak(LeakMeasure):
         # parameters that no recording tells are those of the rig
         prior = self.priors.sums / len(self.healthy)
         healthy = [
-            response.recording._replace(sums=(self.priors.machine_likelihood(response.sums, G) + prior)[None])
+            replace(response, sums=(self.priors.machine_likelihood(response.sums[0], G) + prior)[None])
             for response in self.healthy
         ]
         return rise(

@@ -25,7 +25,6 @@ import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
 from sealscope.diagnosis.estimate.change import Information
-from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.pressures.fit import (
     Block,
     Joint,
@@ -37,7 +36,7 @@ from sealscope.diagnosis.inference.pressures.fit import (
     prior_cost,
     residual_squares,
 )
-from sealscope.diagnosis.inference.pressures.leak import HealthyResponse, ResponseLeak, states_flow
+from sealscope.diagnosis.inference.pressures.leak import ResponseLeak, states_flow
 from sealscope.diagnosis.inference.pressures.reduced_rig import (
     BRISTLES,
     C_C,
@@ -58,7 +57,12 @@ from sealscope.diagnosis.inference.pressures.reduced_rig import (
     Machine,
     response_priors,
 )
-from sealscope.diagnosis.inference.pressures.samples import block_edges, find_unmet_requirement, mains_waves
+from sealscope.diagnosis.inference.pressures.samples import (
+    ResponseSummary,
+    block_edges,
+    find_unmet_requirement,
+    mains_waves,
+)
 from sealscope.diagnosis.priors.pressures import PRESSURE
 from sealscope.physics.lanes import WIDTH
 from sealscope.recordings.joining import start_seconds
@@ -638,7 +642,7 @@ def fit_response(
 
 
 def measure_leak(
-    recording: Recording, rig: Rig, healthy: Sequence[HealthyResponse] = (), *, is_healthy: bool = False
+    recording: Recording, rig: Rig, healthy: Sequence[ResponseSummary] = (), *, is_healthy: bool = False
 ) -> ResponseLeak | None:
     """Measure the leakage of a recording by the response of its pressures.
 
@@ -652,7 +656,7 @@ def measure_leak(
     if healthy:
         law, _ = Counter(response.law for response in healthy).most_common(1)[0]
         healthy = [response for response in healthy if response.law == law]
-        priors = response_priors(rig, law).condition_on([response.sums for response in healthy], G)
+        priors = response_priors(rig, law).condition_on([response.sums[0] for response in healthy], G)
         priors = replace(priors, centre=limit_step(priors.centre, priors.centre))
         fit = fit_response(recording, rig, KnownMachine(law, priors))
     if fit is None:  # no healthy recordings, or the recording is like none of them
@@ -666,17 +670,16 @@ def measure_leak(
     pressure = np.add.reduceat(dp, edges[:-1]) / np.diff(edges)
     mean_speed = rig.motor.omega_per_volt * float(np.mean(np.abs(recording["u"])))
     step = PRESSURE.conductance.wander * math.sqrt(recording.duration / len(middles) / PRESSURE.blocks.wander)
-    conditions = RecordingSums(
+    conditions = ResponseSummary(
         joint.sums(G, step)[None],
+        law=law,
         flow=mean_speed * rig.pump.q_b / (2.0 * np.pi),
         pressure=float(pressure.mean()),
         start_s=start_seconds(recording),
         oil_degC=oil_temperature(recording),
     )
     priors = response_priors(rig, law)
-    return ResponseLeak(
-        parameters, pressure, conditions, law=law, priors=priors, stated=states_flow(rig), healthy=healthy
-    )
+    return ResponseLeak(parameters, pressure, conditions, priors=priors, stated=states_flow(rig), healthy=healthy)
 
 
 def parameter_information(joint: Joint, time: Array, seconds: float) -> dict[str, Information]:

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sealscope.diagnosis.estimate.change import Information, step_tests
-from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
-from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
+from sealscope.diagnosis.healthy import Healthy, healthy_summaries
 from sealscope.diagnosis.inference.observable import Observable, Observed
-from sealscope.diagnosis.inference.pressures.leak import HealthyResponse, ResponseLeak
+from sealscope.diagnosis.inference.pressures.leak import ResponseLeak
 from sealscope.diagnosis.inference.pressures.response import measure_leak
-from sealscope.diagnosis.inference.pressures.samples import find_unmet_requirement
-from sealscope.diagnosis.learnt import learn_once
+from sealscope.diagnosis.inference.pressures.samples import ResponseSummary, find_unmet_requirement
 from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE
 from sealscope.recordings.recording import Recording
 
@@ -28,7 +26,7 @@ RESPONSE = "response"
 class PressureResponse:
     """Leak detector for recordings without a position: it fits the response of p_A - p_B to the command u."""
 
-    name = PRESSURE_RESPONSE
+    name, summary_type = PRESSURE_RESPONSE, ResponseSummary
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
@@ -41,21 +39,10 @@ class PressureResponse:
         """Measure the leakage of a recording by the response of its pressures; None if that fails."""
         return measure_leak(recording, self.rig)
 
-    def learn(self, recording: Recording) -> Summary | None:
-        """Summarise a healthy recording by what it tells of the machine; None if its response cannot be fitted.
-
-        - `law`: law of friction that describes the recording;
-        - the fields of `recording_sums.RecordingSums` that are known.
-        """
-        return learn_once(recording, (self.name, "summary"), self._summarise, self.rig)
-
-    def _summarise(self, recording: Recording) -> Summary | None:
-        """Compute the summary of a healthy recording (`learn`)."""
+    def learn(self, recording: Recording) -> ResponseSummary | None:
+        """Summarise a healthy recording by what it tells of the machine; None if its response cannot be fitted."""
         leak = measure_leak(recording, self.rig, is_healthy=True)
-        if leak is None:
-            return None
-        summary = {"law": leak.law, **leak.conditions._asdict()}
-        return {name: value for name, value in summary.items() if value is not None}
+        return None if leak is None else leak.conditions
 
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
         """Test each parameter of a recording's pressure response for a step, measure the leakage, and report both.
@@ -63,7 +50,7 @@ class PressureResponse:
         The leakage is compared with that of the healthy recordings in `baseline`. If it cannot be measured or a leak
         would not show, the report states only the reason (`lack`).
         """
-        leak = measure_leak(recording, self.rig, _restore_responses(healthy_summaries(self, baseline)))
+        leak = measure_leak(recording, self.rig, healthy_summaries(self, baseline))
         if leak is None:
             return Observed(
                 self.name, lack="the pressures do not respond to the command as those of a pump-driven piston do"
@@ -74,23 +61,6 @@ class PressureResponse:
         judged_until = (np.flatnonzero(is_known)[-1] + 1.0) / len(is_known) if is_known.any() else 0.0
         observables = score_response_steps(leak.parameters)
         return Observed(self.name, observables, leak, share=float(is_known.mean()), judged_until=float(judged_until))
-
-
-def _restore_responses(summaries: Iterable[Summary]) -> list[HealthyResponse]:
-    """Return healthy recordings from their summaries."""
-    return [
-        HealthyResponse(
-            summary["law"],
-            RecordingSums(
-                np.asarray(summary["sums"]),
-                summary["flow"],
-                summary["pressure"],
-                summary.get("start_s"),
-                summary.get("oil_degC"),
-            ),
-        )
-        for summary in summaries
-    ]
 
 
 def score_response_steps(information: Mapping[str, Information]) -> tuple[Observable, ...]:

@@ -1,20 +1,47 @@
-"""Preparation of samples for a fit of the pressure response: requirements, blocks, and waves of the mains hum."""
+"""Recordings for a fit of the pressure response: requirements, summary of a healthy one, blocks, and mains hum."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.estimate.change import MIN_BLOCKS
+from sealscope.diagnosis.healthy import Summary
+from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.rows.weak_form import MAX_READING
 from sealscope.diagnosis.priors.pressures import PRESSURE
+from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE
 from sealscope.recordings.quality import is_mostly_clipped
 from sealscope.recordings.recording import Array, Recording
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ResponseSummary(RecordingSums, Summary):
+    """Summary of a healthy recording by the response of its pressures (`PressureResponse.learn`).
+
+    `law`: law of friction that describes the recording (`reduced_rig.LAWS`); `sums` (1, p + 1, p + 1): likelihood of
+    the averages of p parameters over the recording (`fit.Joint.sums`).
+    """
+
+    method: ClassVar[str] = PRESSURE_RESPONSE
+
+    law: str
+
+    def check(self) -> None:
+        """Check law and shape; raise ValueError if they are unknown or wrong."""
+        from sealscope.diagnosis.inference.pressures.reduced_rig import LAWS, PARAMETERS
+
+        if self.law not in LAWS:
+            raise ValueError(f"law must be {' or '.join(LAWS)}, got {self.law!r}")
+        size = len(PARAMETERS) + 1
+        if self.sums.shape != (1, size, size):
+            raise ValueError(f"sums must be of the shape (1, {size}, {size}), got {self.sums.shape}")
 
 
 def find_unmet_requirement(recording: Recording, rig: Rig) -> str | None:

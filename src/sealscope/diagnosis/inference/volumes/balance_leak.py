@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -382,7 +383,7 @@ class BalanceLeak(LeakMeasure):
             return LeakRise(total_rise)
         balance, chambers = self.balance, self.balance.chambers
         leaks = None if self._hold_rise is None or chambers is None else chambers.leaks_since(step.onset().value)
-        sums = balance.recording_sums._replace(held=leaks)
+        sums = replace(balance.recording_sums, held=leaks)
         rise_after = None if leaks is None else held_rise(sums, self.healthy)
         if rise_after is not None:
             # after the onset the holds show the whole step; `agrees`: standard deviation of log(rise / step)

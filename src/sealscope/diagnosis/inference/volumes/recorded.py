@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -239,13 +239,13 @@ class RecordedBalance:
         start_s, oil_degC = start_seconds(self.recording), oil_temperature(self.recording)
         sums = RecordingSums.from_blocks(self.blocks, self.columns, start_s, oil_degC)
         if self.flow is Flow.CREEP:
-            sums = sums._replace(flow=self.mean_flow)  # a test of creep records no flow of a pump
+            sums = replace(sums, flow=self.mean_flow)  # a test of creep records no flow of a pump
         hold_leaks = None if self.chambers is None else np.array(self.chambers.leaks)
         pump_leakage = None if self.held_pump_leakage is None else np.array(self.held_pump_leakage)
         fit = fit_difference(self.recording)
         is_determined = fit is not None and min(fit.friction_error, fit.drop_error) > 0.0  # 0: without information
         resistance = np.array(fit) if is_determined else None
-        return sums._replace(held=hold_leaks, held_pump=pump_leakage, resistance=resistance)
+        return replace(sums, held=hold_leaks, held_pump=pump_leakage, resistance=resistance)
 
     @cached_property
     def chambers(self) -> HeldChambers | None:

@@ -10,13 +10,14 @@ import numpy as np
 
 from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.estimate.population import ScatterPrior
-from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
+from sealscope.diagnosis.healthy import Healthy, healthy_summaries
 from sealscope.diagnosis.inference.balance_samples import READ
 from sealscope.diagnosis.inference.block_stream import min_samples_for_step
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.circuit.without_position import cycle_balances, recorded_oil_loss_tests
 from sealscope.diagnosis.inference.comparison.levels import leak_deviations_from_mean, rise
 from sealscope.diagnosis.inference.comparison.recording_sums import (
+    BalanceSummary,
     RecordingSums,
     find_unusual_conditions,
     motion_change,
@@ -31,7 +32,6 @@ from sealscope.diagnosis.inference.regimes import RecordedBlocks, RegimeBlocks, 
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.inference.volumes.rivals import rival_rises
-from sealscope.diagnosis.learnt import learn_once
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import VOLUME_BALANCE
 from sealscope.recordings.channels import CHAMBERS, flow_source
@@ -76,7 +76,7 @@ class VolumeBalance:
     - only the position, if the held load creeps in the healthy recordings.
     """
 
-    name = VOLUME_BALANCE
+    name, summary_type = VOLUME_BALANCE, BalanceSummary
 
     def __init__(self, rig: Rig) -> None:
         self.rig = rig
@@ -164,52 +164,36 @@ class VolumeBalance:
             delay_changes=regime.delay_changes, delay_tests=regime.delay_tests,
         )  # fmt: skip
 
-    def learn(self, recording: Recording) -> Summary | None:
-        """Summarise a healthy recording for later comparisons; None if it allows no volume balance.
-
-        A single recording may leave open whether valves cut the pump off from the cylinder while it rests. The summary
-        therefore has Gram matrices for both cases, and log odds, which are later combined over all healthy recordings:
-
-        - the fields of `recording_sums.RecordingSums` that are known, for a pump that stays connected at rest;
-        - `terms`: names of the balance's terms;
-        - `scale`: factor from computed to true flows (`Size`), 0 if no flow can be stated in L/min;
-        - `shut_sums`, `shut_odds`, if the machine rests: Gram matrices for a pump that valves cut off at rest, and the
-          log odds of this case, from the leakage at rest;
-        - `held`, `held_odds`, if it holds a load at rest: leaks while shut valves hold the load, and log odds that the
-          valves are shut, from these leaks; `held_pump`, if known: leakage of the pump just before the valves shut;
-        - `holds`, with a position: numbers of holds (`HoldCounts`);
-        - `sign_log_odds`, with a position: log odds that the recorded flow has the right sign, for each balance;
-        - `delivered`: mean flow of the pump in motion [m^3/s], as computed with the assumed sizes;
-        - `stroke`, with a position: ends of the recorded motion [m];
-        - `creep_odds`, if no pump's flow is recorded (`Flow.CREEP`): log odds that the load creeps by leakage.
-        """
-        return learn_once(recording, (self.name, "summary"), self._summarise, self.rig)
-
-    def _summarise(self, recording: Recording) -> Summary | None:
-        """Compute the summary of a healthy recording (`learn`)."""
+    def learn(self, recording: Recording) -> BalanceSummary | None:
+        """Summarise a healthy recording for later comparisons; None if it allows no volume balance."""
         recorded = self._compute_blocks(recording)
         balance = self.balance(recording) if recorded is None else self._build_balance(recording, recorded.open)
         if balance is None:
             return None
-        summary = {
-            "terms": list(balance.columns[0].names),
-            "scale": balance.size.scale if balance.size.stated else 0.0,
-            "delivered": balance.blocks.moving_flow,
-            "stroke": balance.recorded_stroke,
-            "creep_odds": balance.creep_log_odds() if balance.flow is Flow.CREEP else None,
-            **balance.recording_sums._asdict(),
-        }
-        if recorded is not None:
-            summary["sign_log_odds"] = np.array(recorded.sign_log_odds)
-            summary["holds"] = np.array(recorded.holds)
-        if recorded is not None and recorded.shut is not None:
-            shut_balance = replace(self._build_balance(recording, recorded.shut), valves=Valves.SURELY_SHUT)
-            shut_sums, hold_odds = shut_balance.recording_sums, shut_balance.locked_log_odds(balance.conductance)
-            summary |= {"shut_sums": shut_sums.sums, "shut_odds": recorded.odds}
-            summary |= {"held": shut_sums.held, "held_odds": hold_odds, "held_pump": shut_sums.held_pump}
-        return {name: value for name, value in summary.items() if value is not None}
+        summary = BalanceSummary(
+            **vars(balance.recording_sums),
+            terms=list(balance.columns[0].names),
+            scale=balance.size.scale if balance.size.stated else 0.0,
+            delivered=balance.blocks.moving_flow,
+            stroke=None if balance.recorded_stroke is None else np.array(balance.recorded_stroke),
+            creep_odds=balance.creep_log_odds() if balance.flow is Flow.CREEP else None,
+            sign_log_odds=None if recorded is None else np.array(recorded.sign_log_odds),
+            holds=None if recorded is None else np.array(recorded.holds, dtype=float),
+        )
+        if recorded is None or recorded.shut is None:
+            return summary
+        shut_balance = replace(self._build_balance(recording, recorded.shut), valves=Valves.SURELY_SHUT)
+        shut = shut_balance.recording_sums
+        return replace(
+            summary,
+            shut_sums=shut.sums,
+            shut_odds=recorded.odds,
+            held=shut.held,
+            held_odds=shut_balance.locked_log_odds(balance.conductance),
+            held_pump=shut.held_pump,
+        )
 
-    def predict_rise(self, summaries: Sequence[Summary], channels: frozenset[str], n_repeats: int = 1) -> Rise:
+    def predict_rise(self, summaries: Sequence[BalanceSummary], channels: frozenset[str], n_repeats: int = 1) -> Rise:
         """Predict the distribution of the rise [m^3/(s Pa)] that a healthy recording of a later day will seem to show.
 
         The rise is the leakage of a recording minus that of the healthy recordings with the given `summaries`
@@ -219,27 +203,28 @@ class VolumeBalance:
         """
         odds = self._learn_odds(summaries, channels)
         columns = self._columns(channels, Valves.SHUT if odds.valves > 0.0 else Valves.OPEN)
-        healthy = [_sums_from_summary(summary, columns) for summary in summaries]
-        repetitions = [sums._replace(start_s=_shift_start(sums, k)) for k in range(n_repeats) for sums in healthy]
-        flow, pressure = (float(np.median([summary[name] for summary in summaries])) for name in ("flow", "pressure"))
-        typical = healthy[0]._replace(flow=flow, pressure=pressure, start_s=None, held=None)
+        healthy = [_fit_sums(summary, columns) for summary in summaries]
+        repetitions = [replace(sums, start_s=_shift_start(sums, k)) for k in range(n_repeats) for sums in healthy]
+        flow = float(np.median([summary.flow for summary in summaries]))
+        pressure = float(np.median([summary.pressure for summary in summaries]))
+        typical = replace(healthy[0], flow=flow, pressure=pressure, start_s=None, held=None)
         first_dated = next((sums for sums in healthy if sums.start_s is not None), typical)
         # after all repetitions; undated if no healthy recording has a date
-        later_recording = typical._replace(start_s=_shift_start(first_dated, n_repeats))
+        later_recording = replace(typical, start_s=_shift_start(first_dated, n_repeats))
         return rise(later_recording, repetitions, columns)
 
-    def _learn_odds(self, summaries: Sequence[Summary], channels: frozenset[str]) -> MachineOdds:
+    def _learn_odds(self, summaries: Sequence[BalanceSummary], channels: frozenset[str]) -> MachineOdds:
         """Learn the odds of what is unknown about the machine from summaries of healthy recordings (`learn`).
 
         The right assumption on the valves also makes the estimated leakage scatter less: n recordings with rests
         (`MIN_FOR_SCATTER` or more) together add (n - 1) log(scatter if open / scatter if shut) to its log odds.
         """
-        with_rests, log_ratio = [summary for summary in summaries if "shut_sums" in summary], 0.0
+        with_rests, log_ratio = [summary for summary in summaries if summary.shut_sums is not None], 0.0
         if len(with_rests) >= MIN_FOR_SCATTER:
             scatter = []
             for valves in (Valves.OPEN, Valves.SHUT):
                 columns = self._columns(channels, valves)
-                sums = [_sums_from_summary(summary, columns) for summary in with_rests]
+                sums = [_fit_sums(summary, columns) for summary in with_rests]
                 values = leak_deviations_from_mean(sums, columns)
                 scatter.append(max(float(values.std(ddof=1)), np.finfo(float).tiny))
             log_ratio = (len(with_rests) - 1) * float(np.log(scatter[0] / scatter[1]))
@@ -275,8 +260,8 @@ class VolumeBalance:
         balance = replace(balance, known_stroke=_joint_stroke(summaries))
         # the summaries list the terms without those that only a balance for shut valves has
         names = [name for name in balance.columns[0].names if name not in (TURNING, HOLDING)]
-        comparable = [summary for summary in summaries if summary["terms"] == names]
-        healthy = [_sums_from_summary(summary, balance.columns) for summary in comparable]
+        comparable = [summary for summary in summaries if summary.terms == names]
+        healthy = [_fit_sums(summary, balance.columns) for summary in comparable]
         report = self._report(balance, healthy)
         if comparable or not summaries or report.lack:
             return report
@@ -353,9 +338,9 @@ def compare_motion(
         yield observable
 
 
-def _joint_stroke(summaries: Sequence[Summary]) -> tuple[float, float] | None:
+def _joint_stroke(summaries: Sequence[BalanceSummary]) -> tuple[float, float] | None:
     """Return the ends of the motion in all recordings with the given `summaries` [m]; None if none has a position."""
-    strokes = [summary["stroke"] for summary in summaries if "stroke" in summary]
+    strokes = [summary.stroke for summary in summaries if summary.stroke is not None]
     return (float(min(low for low, _ in strokes)), float(max(high for _, high in strokes))) if strokes else None
 
 
@@ -367,16 +352,13 @@ def _shift_start(recorded: RecordingSums, n_ages: int) -> float | None:
     return None if recorded.start_s is None else recorded.start_s + n_ages * _MAX_AGE_S
 
 
-def _sums_from_summary(summary: Summary, columns: Sequence[ColumnRoles]) -> RecordingSums:
-    """Restore the sums of a healthy recording from its summary (`learn`), for the balances with the given `columns`.
+def _fit_sums(summary: BalanceSummary, columns: Sequence[ColumnRoles]) -> BalanceSummary:
+    """Give a healthy recording the Gram matrices for the balances with the given `columns`.
 
     If these have columns for the leakage of a pump that valves cut off at rest, so have the Gram matrices; they are
     added here if the recording has no rests.
     """
-    sums = np.asarray(summary["sums"], dtype=float)
-    if TURNING in columns[0].names:
-        sums = np.asarray(summary["shut_sums"]) if "shut_sums" in summary else add_pump_columns(sums, summary["terms"])
-    names = ("resistance", "held", "held_pump")
-    measured = {name: np.asarray(summary[name], dtype=float) for name in names if name in summary}
-    start_s, oil_degC = summary.get("start_s"), summary.get("oil_degC")
-    return RecordingSums(sums, summary["flow"], summary["pressure"], start_s, oil_degC, **measured)
+    if TURNING not in columns[0].names:
+        return summary
+    shut = summary.shut_sums
+    return replace(summary, sums=add_pump_columns(summary.sums, summary.terms) if shut is None else shut)

@@ -12,9 +12,9 @@ import pytest
 
 import sealscope as ss
 from sealscope.diagnosis import inspection
-from sealscope.diagnosis.inference.changes import healthy_levels
+from sealscope.diagnosis.healthy import learn_once
+from sealscope.diagnosis.inference.changes.healthy_levels import HealthyLevels
 from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
-from sealscope.diagnosis.learnt import learn_once
 from sealscope.storage.kept_results import MISSING, SUFFIX, keep_result, remove_oldest, restore_result
 
 
@@ -89,7 +89,7 @@ def test_the_oldest_results_are_removed(tmp_path: Path) -> None:
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Keep results in a temporary folder."""
-    monkeypatch.setattr("sealscope.diagnosis.learnt.results_folder", lambda: tmp_path)
+    monkeypatch.setattr("sealscope.diagnosis.healthy.results_folder", lambda: tmp_path)
     return tmp_path
 
 
@@ -135,8 +135,8 @@ def test_a_verdict_beside_recordings_that_were_learnt_before_is_the_same(
         """Fail, as nothing is to be computed again."""
         raise AssertionError("what was learnt before is computed again")
 
-    monkeypatch.setattr(VolumeBalance, "_summarise", fail)
-    monkeypatch.setattr(healthy_levels, "_estimate_levels", fail)
+    for detector in (VolumeBalance, HealthyLevels):
+        monkeypatch.setattr(detector, "learn", fail)
     monkeypatch.setattr("sealscope.diagnosis.detectors.observation._compute_surprisals", fail)
     inspect, inspected = inspection._inspect, list[ss.Recording]()
     monkeypatch.setattr(
