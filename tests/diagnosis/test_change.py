@@ -16,8 +16,9 @@ from sealscope.diagnosis.estimate.change import (
     StepTest,
     filter_changes,
     fit_history,
+    largest_step_likelihood,
     step_test,
-    whitened_step_test,
+    step_tests_of_columns,
 )
 from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.live.kernel import step as stream
@@ -437,10 +438,28 @@ def test_whitened_values_are_tested_as_blocks_are(seed: int) -> None:
     count, n = 7, 12
     effects, values = random.standard_normal((n, count)), random.standard_normal(n) + 1.5 * random.standard_normal()
     values += 2.0 * effects[:, 3]
-    test = whitened_step_test(effects, values, np.array([0.1 * (seed + 1)]))
-    inverse = np.linalg.inv(np.eye(n) + 0.1 * (seed + 1) * n / np.trace(effects @ effects.T) * effects @ effects.T)
-    energies, moments = np.diag(effects.T @ inverse @ effects), effects.T @ inverse @ values
-    squares = values @ inverse @ values - np.maximum(moments, 0.0) ** 2 / energies
-    expected = 0.5 * np.linalg.slogdet(inverse)[1] - 0.5 * n * np.log(squares / n)
-    np.testing.assert_allclose(test.likelihood, expected, rtol=1e-9)
-    assert test.best == int(np.argmax(expected))
+    cases = np.array([effects, 2.0 * random.standard_normal((n, count))])
+    walks = np.array([0.1, 0.2]) * (seed + 1)
+    likelihoods, likeliest = largest_step_likelihood(cases, values, walks)
+    for matrix, likelihood, walk in zip(cases, likelihoods, likeliest, strict=True):
+        highest = []
+        for variance in walks * n / np.trace(matrix @ matrix.T):
+            inverse = np.linalg.inv(np.eye(n) + variance * matrix @ matrix.T)
+            energies, moments = np.diag(matrix.T @ inverse @ matrix), matrix.T @ inverse @ values
+            squares = values @ inverse @ values - np.maximum(moments, 0.0) ** 2 / energies
+            highest.append((0.5 * np.linalg.slogdet(inverse)[1] - 0.5 * n * np.log(squares / n)).max())
+        assert likelihood == pytest.approx(max(highest), rel=1e-9)
+        assert walk == walks[np.argmax(highest)]
+
+
+def test_coefficients_of_one_precision_are_tested_as_each_alone() -> None:
+    """Up or down, with the log likelihood of each, tested or not, without a step."""
+    random, time = np.random.default_rng(5), np.arange(12.0)
+    values = random.standard_normal((12, 3)) - 4.0 * (time > 6.0)[:, None]
+    tested = step_tests_of_columns(Information(time, np.eye(12), values), 2)
+    assert tested is not None
+    tests, without = tested
+    alone = [step_test(Information(time, np.eye(12), column), (1.0, -1.0)) for column in values.T]
+    expected = [number for test in alone[:2] if test for number in (test.score, test.sign)]
+    assert [number for test in tests for number in (test.score, test.sign)] == pytest.approx(expected, rel=1e-12)
+    assert without == pytest.approx([test.likelihood.max() - 0.5 * test.score for test in alone if test], rel=1e-12)

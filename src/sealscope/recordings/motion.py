@@ -81,7 +81,9 @@ def describe_line(recording: Recording) -> str | None:
 
 def find_runs(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
     """Find the runs of True in `flags` (n,): first index and length of each (k, 2)."""
-    edges = np.flatnonzero(np.diff(np.r_[False, flags, False].astype(np.int8)))  # starts and ends in turn
+    padded = np.zeros(len(flags) + 2, dtype=bool)
+    padded[1:-1] = flags
+    edges = np.flatnonzero(padded[1:] != padded[:-1])  # starts and ends in turn
     return np.column_stack([edges[::2], edges[1::2] - edges[::2]])
 
 
@@ -107,7 +109,6 @@ def find_stuck(values: Array) -> NDArray[np.intp]:
     runs, first, last = runs[inner], first[inner], last[inner]
     if not runs.size:
         return no_runs
-    quantum = smallest_step(np.unique(values))
     n_unchanged = np.r_[0, np.cumsum(is_same)]
 
     def unchanged_fraction(begin: NDArray[Any], end: NDArray[Any]) -> Array:
@@ -120,5 +121,7 @@ def find_stuck(values: Array) -> NDArray[np.intp]:
     )
     log_expected = np.log(values.size) + runs[:, 1] * np.log(p_unchanged)
     jump = np.maximum(np.abs(values[first] - values[first - 1]), np.abs(values[last + 1] - values[last]))
-    is_stuck = (log_expected < np.log(_MAX_EXPECTED)) & (jump > _MIN_JUMP * quantum)
+    is_stuck = (log_expected < np.log(_MAX_EXPECTED)) & (jump > 0.0)
+    if is_stuck.any():
+        is_stuck &= jump > _MIN_JUMP * smallest_step(np.unique(values))
     return np.column_stack([first[is_stuck], runs[is_stuck, 1] + 1])

@@ -414,7 +414,7 @@ def find_rails(values: Array, unit: str, stuck: NDArray[np.intp] | None = None, 
     stuck_values = np.empty(0) if stuck is None else values[stuck[:, 0]]
     ends = values.min(), values.max()
     max_count = max(np.count_nonzero(values == end) for end in ends)
-    if max_count < _RAIL.samples and not np.isin(stuck_values, ends).any():  # neither case: no need to sort
+    if max_count < _RAIL.samples and not any(end in stuck_values for end in ends):  # neither case: no need to sort
         return []
     distinct, counts = np.unique(values, return_counts=True)
     if distinct.size < 3:

@@ -406,35 +406,51 @@ def step_tests(information: Information, signs: Sequence[float], shape: Array | 
         return []
     whitening, z, onsets = whitened
     steps = whitening.unit_steps if shape is None else _Steps(whitening, shape)
-    return [_test_step(whitening, onsets, steps, z, sign) for sign in signs]
+    return _test_steps(whitening, onsets, steps, z, signs)
 
 
-def whitened_step_test(effects: Array, values: Array, walks: Array = WALKS) -> StepTest:
-    """Test whitened values (n,) for a step up of a quantity, by the `effects` (n, K) of a unit step from each block on.
+def step_tests_of_columns(information: Information, n_tested: int) -> tuple[list[StepTest], Array] | None:
+    """Test the first `n_tested` of c coefficients of one precision for a step up or down (`step_test`).
 
-    The values have independent noise of one variance, and a random walk of the quantity changes them as steps in all
-    blocks do: with S the `effects`, their covariance is kappa (I + q S S'). `walks`: variances q that are tried, in
-    units of the one for which walk and noise have the same mean variance; the result states them in this unit, too, and
-    its onsets are counted in blocks.
+    `information`: as for one coefficient, but `vector` is (K, c). Also returns the log likelihood of each coefficient
+    without a step, with a fitted random walk, (c,). None if too few blocks have information.
     """
-    eigen, vectors = np.linalg.eigh(effects.T @ effects)
-    is_informative = eigen > RANK_TOLERANCE * max(float(eigen[-1]), TINY)
-    eigen, vectors = eigen[is_informative], vectors[:, is_informative]
+    whitened = _whiten_blocks(information)
+    if whitened is None:
+        return None
+    whitening, values, onsets = whitened
+    tests = [_test_steps(whitening, onsets, whitening.unit_steps, z, (1.0, -1.0)) for z in values.T[:n_tested]]
+    squares, n = np.maximum(whitening.weight @ values**2, TINY), len(values)
+    without = (whitening.log_factor[:, None] - 0.5 * n * np.log(squares / n)).max(axis=0)
+    return [max(both, key=lambda test: test.score) for both in tests], without
+
+
+def largest_step_likelihood(effects: Array, values: Array, walks: Array = WALKS) -> tuple[Array, Array]:
+    """Compute the largest log likelihood of whitened values (n,) with a step up of a quantity, over onsets and walks.
+
+    The values have independent noise of one variance. A unit step from block k on changes them by column k of the
+    `effects` (..., n, K), of which there may be several cases. A random walk of the quantity changes them as steps in
+    all blocks do: with S the `effects`, their covariance is kappa (I + q S S'). `walks`: variances q that are tried, in
+    units of the one for which walk and noise have the same mean variance. Also returns the likeliest walk of each case.
+    """
+    transposed = np.swapaxes(effects, -1, -2)
+    eigen, vectors = np.linalg.eigh(transposed @ effects)
+    is_informative = eigen > RANK_TOLERANCE * np.maximum(eigen[..., -1:], TINY)
+    eigen = np.where(is_informative, eigen, 0.0)
     roots = np.sqrt(eigen)
-    z = (effects.T @ values) @ vectors / roots
-    rest = max(float(values @ values - z @ z), 0.0)  # squares of what no step changes
-    blocks = np.arange(effects.shape[1])
-    whitening = _Whitening(
-        increments=roots[:, None] * vectors.T,
-        eigen=len(values) / max(float(eigen.sum()), TINY) * eigen,
-        unit=1.0,
-        positions=blocks.astype(float),
-        block=blocks,
-        after=np.zeros(len(blocks)),
-        walks=walks,
-        walk_log_priors=np.zeros(len(walks)),
-    )
-    return _test_step(whitening, whitening.positions, whitening.unit_steps, z, 1.0, rest, len(values))
+    # coefficients of the values on the directions in which steps change them, 0 in those without information
+    z = ((transposed @ values)[..., None, :] @ vectors)[..., 0, :] / np.where(is_informative, roots, np.inf)
+    n = len(values)
+    mean_one = n / np.maximum(eigen.sum(axis=-1, keepdims=True), TINY) * eigen
+    weight = 1.0 / (1.0 + walks[:, None] * mean_one[..., None, :])  # (..., w, K)
+    steps = roots[..., None] * np.swapaxes(vectors, -1, -2)  # change of z by a step in each block
+    rest = np.maximum(values @ values - (z**2).sum(axis=-1), 0.0)  # squares of what no step changes
+    total = np.maximum((weight @ z[..., None] ** 2)[..., 0] + rest[..., None], TINY)
+    moments, energies = (weight * z[..., None, :]) @ steps, np.maximum(weight @ steps**2, TINY)
+    gains = (np.maximum(moments, 0.0) ** 2 / energies).max(axis=-1)  # a step down is not fitted
+    squares = np.maximum(total - gains, MIN_RESIDUAL * total)
+    likelihoods = 0.5 * np.log(weight).sum(axis=-1) - 0.5 * n * np.log(squares / n)
+    return likelihoods.max(axis=-1), walks[likelihoods.argmax(axis=-1)]
 
 
 def step_sizes(
@@ -737,48 +753,51 @@ def _transform_blocks(
                 to_z[i, k] -= product * changes[m, k]
 
 
-def _test_step(
-    whitening: _Whitening, onsets: Array, steps: _Steps, z: Array, sign: float, rest: float = 0.0, count: int = 0
-) -> StepTest:
+def _test_steps(
+    whitening: _Whitening, onsets: Array, steps: _Steps, z: Array, signs: Sequence[float]
+) -> list[StepTest]:
     """Test whitened values z (n,) of a coefficient for a step at any of o `onsets` [s], by the likelihood ratio.
 
-    `sign`: 1 for a step up, -1 for a step down; `rest`: sum of squares of further values, whose noise has the same
-    variance; `count`: number of all values, 0 if there are no others.
+    `signs`: 1 for a step up, -1 for a step down, with a test each.
     """
-    n, unit = count or len(z), whitening.unit
+    n, unit = len(z), whitening.unit
     weighted = whitening.weight * z
-    total = np.maximum(weighted @ z + rest, TINY)  # weighted sum of the values' squares, for each walk
-    courses, numbers = np.empty((3, len(onsets))), np.empty(9)
-    _score_step(
-        whitening.log_factor,
-        whitening.walks,
-        whitening.walk_log_priors,
-        whitening.block,
-        whitening.after,
-        steps.inverse_energies,
-        steps.lengths,
-        weighted @ steps.whole,
-        total,
-        sign,
-        n,
-        courses,
-        numbers,
-    )
-    score, best, *fitted, noise_without, noise_with, walk_without, walk_with, length = numbers.tolist()
-    return StepTest(
-        score=score,
-        best=int(best),
-        positions=whitening.positions,
-        onsets=onsets,
-        likelihood=courses[0],
-        size=courses[1],
-        deviation=courses[2],
-        fitted=Estimate(*fitted),
-        walk=(unit * walk_without, unit * walk_with),
-        noise=(noise_without, noise_with),
-        law=NullLaw(dimensions=min(n, 0.5 * n + 2.0), length=length),  # degrees of freedom: see the module
-        sign=sign,
-    )
+    total = np.maximum(weighted @ z, TINY)  # weighted sum of the values' squares, for each walk
+    moments, tests = weighted @ steps.whole, list[StepTest]()
+    for sign in signs:
+        courses, numbers = np.empty((3, len(onsets))), np.empty(9)
+        _score_step(
+            whitening.log_factor,
+            whitening.walks,
+            whitening.walk_log_priors,
+            whitening.block,
+            whitening.after,
+            steps.inverse_energies,
+            steps.lengths,
+            moments,
+            total,
+            sign,
+            n,
+            courses,
+            numbers,
+        )
+        score, best, *fitted, noise_without, noise_with, walk_without, walk_with, length = numbers.tolist()
+        test = StepTest(
+            score=score,
+            best=int(best),
+            positions=whitening.positions,
+            onsets=onsets,
+            likelihood=courses[0],
+            size=courses[1],
+            deviation=courses[2],
+            fitted=Estimate(*fitted),
+            walk=(unit * walk_without, unit * walk_with),
+            noise=(noise_without, noise_with),
+            law=NullLaw(dimensions=min(n, 0.5 * n + 2.0), length=length),  # degrees of freedom: see the module
+            sign=sign,
+        )
+        tests.append(test)
+    return tests
 
 
 @kernel
@@ -797,7 +816,7 @@ def _score_step(
     courses: Array,
     numbers: Array,
 ) -> None:
-    """Maximise the likelihoods of a step and of no step over the variances of walk and noise, for `_test_step`.
+    """Maximise the likelihoods of a step and of no step over the variances of walk and noise, for `_test_steps`.
 
     A step down is a step up of the values with the opposite sign. `moments` (w, K + 1): weighted products of the
     `_Steps.whole` with the values, for each walk; `total` (w,): those of the values with themselves. Writes to

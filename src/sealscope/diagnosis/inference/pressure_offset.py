@@ -32,7 +32,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.estimate.change import MIN_BLOCKS, RANK_TOLERANCE, WALKS, whitened_step_test
+from sealscope.diagnosis.estimate.change import MIN_BLOCKS, RANK_TOLERANCE, WALKS, largest_step_likelihood
 from sealscope.diagnosis.estimate.linear import Gaussian
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, estimate_leak_and_bias, offset_cost, sum_blocks
 from sealscope.diagnosis.inference.equations.feed import motions_of_side
@@ -112,24 +112,24 @@ def _find_relative_offset(
     """
     usual, far = INFERENCE.zero.pressure, INFERENCE.zero.far  # standard deviations of the prior [Pa]
     # no walk larger than the best one without an offset: otherwise an offset could explain changes that no leak causes
-    walks = WALKS[whitened_step_test(leak_steps, residuals).walk[1] >= WALKS]
+    walks = WALKS[largest_step_likelihood(leak_steps, residuals)[1] >= WALKS]
 
     # the residual of the balance repeats from cycle to cycle, so not all residuals are independent
     independent_fraction = min(1.0, INFERENCE.size.readings / len(residuals))
 
-    def log_likelihood(position: float) -> float:
-        """Compute the log likelihood at asinh(offset) = `position`, scaled to the number of independent residuals."""
-        steps = leak_steps - np.sinh(position) * flow_offset_steps
-        return independent_fraction * float(whitened_step_test(steps, residuals, walks).likelihood.max())
+    def log_likelihood(positions: Array | float) -> Array:
+        """Compute the log likelihoods at asinh(offset) = `positions`, scaled to the number of independent residuals."""
+        steps = leak_steps - np.sinh(positions)[..., None, None] * flow_offset_steps
+        return independent_fraction * largest_step_likelihood(steps, residuals, walks)[0]
 
     def cost(position: float) -> float:
         """Compute minus the log posterior density at asinh(offset) = `position`, up to a constant."""
         # in the prior, a relative offset of 1 is `usual` [Pa], also for pressures in counts
-        return 0.5 * float(offset_cost(usual * float(np.sinh(position)))) - log_likelihood(position)
+        return 0.5 * float(offset_cost(usual * float(np.sinh(position)))) - float(log_likelihood(position))
 
     positions = np.arcsinh(min(3.0 * far / usual, max_offset)) * np.linspace(-1.0, 1.0, N_GRID)
     # search about offset 0, where the prior has its maximum, and about the maximum of the likelihood
-    starts = {N_GRID // 2, int(np.argmax([log_likelihood(position) for position in positions]))}
+    starts = {N_GRID // 2, int(np.argmax(log_likelihood(positions)))}
     minima = []
     for start in starts:
         low, high = positions[max(start - 1, 0)], positions[min(start + 1, N_GRID - 1)]  # neighbours on the grid

@@ -87,6 +87,8 @@ def find_spikes(values: Array) -> NDArray[np.intp]:
     jumps = np.where(steps[:-1] * steps[1:] < 0.0, np.minimum(step_sizes[:-1], step_sizes[1:]), 0.0)
     thinned_sizes = step_sizes[:: max(1, step_sizes.size // _N_CHANGES)]  # enough for a quantile
     usual_step = float(np.quantile(thinned_sizes, 0.9))
+    if not (jumps > _SPIKE.times * usual_step).any():  # as in most channels: no need to sort the values
+        return np.empty(0, dtype=np.intp)
     threshold = _SPIKE.times * usual_step + _MIN_QUANTA * estimate_quantum(values[known])
     # larger change just before or after the leap; the slope is the larger of this and the mean change across the leap
     outer_steps = np.maximum(np.append(0.0, step_sizes[:-2]), np.append(step_sizes[2:], 0.0))
@@ -232,6 +234,9 @@ def estimate_holding_period(t: Array, values: Array) -> float | None:
     if np.count_nonzero(known) < _STALE.runs:
         return None
     t, values = t[known], values[known]
+    # so few repeats cannot make the median of `stale.runs` lengths two samples
+    if 2 * np.count_nonzero(values[1:] == values[:-1]) < _STALE.runs:
+        return None
     starts, is_bounded = _find_equal_runs(values)
     ends = np.r_[starts[1:], values.size]
     lengths = (ends - starts)[is_bounded]
@@ -283,15 +288,15 @@ def _flag_repeated_rows(channels: list[Array]) -> NDArray[np.bool_]:
     # the jumps below need the rows first - 2 and stop
     is_short = (stop - first < _MAX_REPEAT) & (first > 1) & (stop < is_same.size)
     first, stop = first[is_short], stop[is_short]
-    is_candidate = np.zeros(first.size, dtype=bool)
-    for values in moving:
+    is_candidate, repeated = np.zeros(first.size, dtype=bool), np.zeros(is_same.size, dtype=bool)
+    # the product of the last two factors is the number of repeated rows expected by chance
+    fewest = _STALE.repeats * max(p_equal, _STALE.fewest) * is_same.size
+    for values in moving if first.size >= fewest else ():
         min_jump = _MIN_JUMP * estimate_quantum(values[np.isfinite(values)])
         jumps_before = np.abs(values[first - 1] - values[first - 2]) > min_jump
         jumps_after = np.abs(values[stop] - values[stop - 1]) > min_jump
         is_candidate |= jumps_before & jumps_after
-    repeated = np.zeros(is_same.size, dtype=bool)
-    # the product of the last two factors is the number of repeated rows expected by chance
-    if np.count_nonzero(is_candidate) >= _STALE.repeats * max(p_equal, _STALE.fewest) * is_same.size:
+    if np.count_nonzero(is_candidate) >= fewest:
         for begin, end in zip(first[is_candidate].tolist(), stop[is_candidate].tolist(), strict=True):
             repeated[begin:end] = True
     return repeated

@@ -34,7 +34,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sealscope.diagnosis.estimate.change import MIN_BLOCKS, RANK_TOLERANCE, Information, step_test
+from sealscope.diagnosis.estimate.change import MIN_BLOCKS, RANK_TOLERANCE, Information, step_tests_of_columns
 from sealscope.diagnosis.estimate.interval import Estimate, Interval
 from sealscope.diagnosis.inference.equations.signals import HALF_DIFFERENCE, central_difference
 from sealscope.diagnosis.inference.hypotheses import temper
@@ -334,7 +334,9 @@ def _whitening_matrix(values: Array) -> Array:
     differences = differences / deviations
     scatter = differences.T @ differences / len(differences)
     for _ in range(_SCATTER_ITERATIONS):
-        squares = ((differences @ np.linalg.pinv(scatter, hermitian=True)) * differences).sum(axis=1)
+        eigen, basis = np.linalg.eigh(scatter)
+        is_known = eigen > np.finfo(float).eps * eigen[-1]
+        squares = ((differences @ basis[:, is_known]) ** 2 / eigen[is_known]).sum(axis=1)
         weights = (_PRIORS.freedom + len(varying)) / (_PRIORS.freedom + squares)
         scatter = (differences * weights[:, None]).T @ differences / len(differences)
     eigen, basis = np.linalg.eigh(scatter)
@@ -351,26 +353,28 @@ def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> Obser
     cannot be tested. The score of the result is the rank, for which all directions have one variance in common. For the
     p-value only the directions of the pattern count, each with its own variance (formulas: see the module).
     """
-    basis, triangle = np.linalg.qr(rows.T)
-    # orthonormal directions, without those of vectors that depend on earlier ones
-    basis = basis[:, np.abs(np.diag(triangle)) > RANK_TOLERANCE * np.abs(triangle).max()]
-    n_blocks, n_directions = len(time), basis.shape[1]
+    # orthonormal directions: those of the pattern, without vectors that depend on earlier ones, and the others, which
+    # it does not change
+    directions, triangle = np.linalg.qr(rows.T, mode="complete")
+    sizes = np.abs(np.diag(triangle))
+    is_changed = np.zeros(len(directions), dtype=bool)
+    is_changed[: len(sizes)] = sizes > RANK_TOLERANCE * np.abs(triangle).max()
+    n_blocks, n_directions = len(time), int(np.count_nonzero(is_changed))
     if not n_directions:
         return None
-    # followed by the directions in which the pattern changes nothing
-    directions = np.column_stack([basis, np.linalg.qr(basis, mode="complete")[0][:, n_directions:]])
-    components = [Information(time, np.eye(n_blocks), whitened @ direction) for direction in directions.T]
-    tests = [test for component in components if (test := step_test(component, signs=(1.0, -1.0))) is not None]
-    if len(tests) < len(components):
+    directions = np.column_stack([directions[:, is_changed], directions[:, ~is_changed]])
+    tested = step_tests_of_columns(Information(time, np.eye(n_blocks), whitened @ directions), n_directions)
+    if tested is None:
         return None
+    tests, likelihood_without = tested
     # variance of each direction without a step, and with a step at each onset, which is at most as large: v for the log
     # likelihood -n log(v) / 2
     likelihood = np.array([test.likelihood for test in tests])
-    likelihood_without = likelihood.max(axis=1) - 0.5 * np.array([test.score for test in tests])
     variance_without = np.exp(-2.0 / n_blocks * likelihood_without)
-    variance = np.minimum(np.exp(-2.0 / n_blocks * likelihood), variance_without[:, None])[:n_directions]
+    variance = np.minimum(np.exp(-2.0 / n_blocks * likelihood), variance_without[:n_directions, None])
     unexplained = variance_without[n_directions:].sum()
-    log_ratios = 0.5 * len(tests) * n_blocks * np.log(variance_without.sum() / (variance.sum(axis=0) + unexplained))
+    n_values = len(directions) * n_blocks
+    log_ratios = 0.5 * n_values * np.log(variance_without.sum() / (variance.sum(axis=0) + unexplained))
     best = int(np.argmax(log_ratios))
     log_ratio = float(log_ratios[best])
     # a pattern describes the levels only approximately
@@ -379,7 +383,7 @@ def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> Obser
     gains = np.log1p((variance_without[:n_directions, None] / variance - 1.0).sum(axis=0))
     score = n_blocks * float(gains.max())
     # up or down in each direction, by the law under which the score is the most probable
-    chance = 2.0 * n_directions * max(test.law.chance(score) for test in tests[:n_directions])
+    chance = 2.0 * n_directions * max(test.law.chance(score) for test in tests)
     onset, block = float(tests[0].onsets[best]), float(time[1] - time[0])  # onsets are the same in all directions
     interval = Interval(onset, onset - block, onset + block)
     return Observable(name=name, data="levels", score=rank, chance=min(1.0, chance), onset=interval)
