@@ -6,7 +6,8 @@ the modules from which these take constants, the versions of numba and Python, a
 cache folder, unless `SEALSCOPE_CACHE_DIR` moves it; an empty value turns caching off. Compiled code is unpickled, which
 can run any command: only folders that no other user can write are used.
 
-Kernels are functions that Python calls; laws are functions, such as a formula of physics, that kernels call.
+Kernels are functions that Python calls; laws are functions, such as a formula of physics, that kernels call. They
+allocate nothing, and write to arrays of the caller.
 """
 
 from __future__ import annotations
@@ -248,7 +249,8 @@ def copy_to_stack(context: Any, record: Any) -> Any:
     def emit_copy(target: Any, builder: Any, signature: Any, values: Any) -> Any:
         """Emit LLVM instructions that load the record at the address `values[0]` and store it on the stack."""
         if not isinstance(record, types.Record):
-            target.nrt.incref(builder, record, values[0])  # the arrays of a tuple have one more owner
+            if target.enable_nrt:
+                target.nrt.incref(builder, record, values[0])  # the arrays of a tuple have one more owner
             return values[0]
         copy = cgutils.alloca_once(builder, values[0].type.pointee)
         cgutils.raw_memcpy(builder, copy, values[0], target.get_constant(types.intp, record.size), 1)

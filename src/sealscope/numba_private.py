@@ -20,13 +20,13 @@ from numba.core import config, types
 from numba.core.caching import FunctionCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase
-from numba.core.compiler_machinery import PassManager
+from numba.core.compiler_machinery import PassManager, register_pass
+from numba.core.lowering import Lower
 from numba.core.registry import CPUDispatcher
-from numba.core.runtime import rtsys
 from numba.core.typed_passes import (
     AnnotateTypes,
+    BaseNativeLowering,
     IRLegalization,
-    NativeLowering,
     NoPythonBackend,
     NopythonTypeInference,
     PreLowerStripPhis,
@@ -52,11 +52,10 @@ class TolerantCache(FunctionCache):  # type: ignore[misc]
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """Load the compiled code of a function for the argument types `sig`; None if it is missing or damaged.
 
-        Loaded code needs numba's reference counting, which is set up here; the remaining set-up of numba takes longer
-        than loading, and is left to the next compilation. A damaged cache is emptied.
+        The set-up of numba takes longer than loading, and is left to the next compilation: loaded code needs none of
+        it, as kernels count no references. A damaged cache is emptied.
         """
         try:
-            rtsys.initialize(target_context)
             with self._guard_against_spurious_io_errors():
                 return self._load_overload(sig, target_context)
         except Exception as error:  # unpickling a truncated file raises errors of many classes
@@ -73,16 +72,87 @@ class TolerantCache(FunctionCache):  # type: ignore[misc]
             _log.debug("cannot save compiled code in %s: %s", self.cache_path, error)
 
 
+class _Lower(Lower):  # type: ignore[misc]
+    """numba's translation into LLVM code, with fewer instructions where a number of an array is read or set.
+
+    An array is a value of seven or more fields, which numba copies to memory at each access; the optimiser has to find
+    out that this has no effect.
+    """
+
+    def _address_of_number(self, array: Any, index: Any) -> Any:
+        """Emit code for the address of a number of a contiguous array; None if it is another array or index.
+
+        `array`, `index`: numba's variables. As in numba and Python, an index below 0 counts from the end, and none is
+        checked against the array's size.
+        """
+        array_type, index_type = self.typeof(array.name), self.typeof(index.name)
+        is_tuple = hasattr(index_type, "types")
+        axis_types = index_type.types if is_tuple else (index_type,)
+        if type(array_type) is not types.Array or array_type.layout != "C" or len(axis_types) != array_type.ndim:
+            return None
+        if not all(isinstance(axis_type, types.Integer) for axis_type in axis_types):
+            return None
+        if not isinstance(array_type.dtype, types.Number):
+            return None
+        build, cast = self.builder, self.context.cast
+        fields, position = self.loadvar(array.name), self.context.data_model_manager[array_type].get_field_position
+        data, shape = (build.extract_value(fields, position(name)) for name in ("data", "shape"))
+        indices, place = self.loadvar(index.name), None
+        for axis, axis_type in enumerate(axis_types):
+            k, size = build.extract_value(indices, axis) if is_tuple else indices, build.extract_value(shape, axis)
+            k = cast(build, k, axis_type, types.intp)
+            if axis_type.signed:
+                k = build.select(build.icmp_signed("<", k, k.type(0)), build.add(k, size), k)
+            place = k if place is None else build.add(build.mul(place, size), k)
+        return build.gep(data, [place])
+
+    def lower_getitem(self, result_type: Any, expression: Any, value: Any, index: Any, signature: Any) -> Any:
+        """Emit code that reads an element."""
+        address = self._address_of_number(value, index)
+        if address is None:
+            return super().lower_getitem(result_type, expression, value, index, signature)
+        number_type = self.typeof(value.name).dtype
+        number = self.context.unpack_value(self.builder, number_type, address)
+        return self.context.cast(self.builder, number, number_type, result_type)
+
+    def lower_setitem(self, target: Any, index: Any, value: Any, signature: Any) -> Any:
+        """Emit code that sets an element."""
+        address = self._address_of_number(target, index)
+        if address is None:
+            return super().lower_setitem(target, index, value, signature)
+        number_type = self.typeof(target.name).dtype
+        number = self.context.cast(self.builder, self.loadvar(value.name), self.typeof(value.name), number_type)
+        return self.context.pack_value(self.builder, number_type, number, address)
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)  # type: ignore[untyped-decorator]
+class _Lowering(BaseNativeLowering):  # type: ignore[misc]
+    """numba's pass that translates a function into LLVM code, by `_Lower`."""
+
+    _name = "sealscope_lowering"
+    lowering_class = _Lower
+
+
 #: Passes that code of numbers and arrays needs; those for closures, literals and array expressions are left out.
 _PASSES = (
     *(TranslateByteCode, FixupArgs, IRProcessing, RewriteSemanticConstants, ConstantLengths, DeadBranchPrune),
     *(GenericRewrites, ReconstructSSA, NopythonTypeInference, PreLowerStripPhis, IRLegalization, AnnotateTypes),
-    *(NativeLowering, NoPythonBackend),
+    *(_Lowering, NoPythonBackend),
 )
 
 
+class _Library(JITCodeLibrary):  # type: ignore[misc]
+    """Compiled code of a function and of those that it calls, optimised once, as a whole."""
+
+    def _optimize_functions(self, module: Any) -> None:
+        """Leave out the passes over single functions: those over the whole library, which follow, repeat them."""
+        module.data_layout = self._codegen._data_layout
+
+
 class _ShortCompiler(CompilerBase):  # type: ignore[misc]
-    """numba's compiler with only the passes in `_PASSES`."""
+    """numba's compiler with only the passes in `_PASSES`; its result is machine code in a `library`."""
+
+    library = _Library
 
     def compile_extra(self, function: Any) -> Any:
         """Compile a function, and the laws it calls, without collections of garbage, which take a tenth of the time.
@@ -99,6 +169,8 @@ class _ShortCompiler(CompilerBase):  # type: ignore[misc]
 
     def define_pipelines(self) -> list[Any]:
         """Build a list with one pipeline of numba, which has the passes in `_PASSES`."""
+        self.state.library = self.library(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
+        self.state.library.enable_object_caching()
         pipeline = PassManager("nopython")
         for step in _PASSES:
             pipeline.add_pass(step, step.__name__)
@@ -112,9 +184,11 @@ _config_lock = Lock()
 def _dispatcher(function: Callable[..., Any], options: dict[str, Any], folder: Path | None) -> Any:
     """Build numba's dispatcher, which compiles the function when it is called; `options`: further ones of `njit`.
 
-    `folder`: folder of the cache, None for no cache.
+    The function allocates nothing, so that its code counts no references to arrays (`_nrt`): it writes to arrays of the
+    caller. `folder`: folder of the cache, None for no cache.
     """
-    dispatcher = numba.njit(pipeline_class=_ShortCompiler, nogil=True, error_model="numpy", **options)(function)
+    options = {"pipeline_class": _ShortCompiler, "nogil": True, "error_model": "numpy", "_nrt": False, **options}
+    dispatcher = numba.njit(**options)(function)
     if folder is None:
         return dispatcher
     # numba reads this global setting when the cache is made. It is restored for other users of numba in the process;
@@ -136,16 +210,12 @@ def compile_kernel(function: Callable[..., Any], folder: Path | None) -> Any:
     return _dispatcher(function, {"no_cfunc_wrapper": True}, folder)
 
 
-class _LawLibrary(JITCodeLibrary):  # type: ignore[misc]
+class _LawLibrary(_Library):
     """Compiled code of a function that only other compiled functions call, without machine code of its own.
 
     The code is linked into these functions as LLVM code. It is optimised here once, not in each function that calls it,
     so that all of them compute identical results.
     """
-
-    def _optimize_functions(self, module: Any) -> None:
-        """Leave out the passes over single functions: those over the whole library, which follow, repeat them."""
-        module.data_layout = self._codegen._data_layout
 
     def _finalize_final_module(self) -> None:
         """Mark the library as final without generating machine code, which numba would do here."""
@@ -155,10 +225,11 @@ class _LawLibrary(JITCodeLibrary):  # type: ignore[misc]
 class _LawCompiler(_ShortCompiler):
     """Compiler of laws, the functions for other compiled functions; its result is LLVM code in a `_LawLibrary`."""
 
+    library = _LawLibrary
+
     def define_pipelines(self) -> list[Any]:
         """Build a list with one pipeline of numba, with the passes in `_PASSES` but without machine code."""
         self.state.flags.no_compile = True
-        self.state.library = _LawLibrary(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
         return super().define_pipelines()
 
 

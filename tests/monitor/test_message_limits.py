@@ -128,8 +128,8 @@ class CountedBytes:
 @pytest.mark.parametrize("payload", [*HOSTILE.values(), cbor2.dumps(GOOD)], ids=[*HOSTILE, "valid"])
 def test_the_walk_looks_at_each_byte_a_few_times_at_most(payload: bytes):
     counted = CountedBytes(payload)
-    outcome = message_limits._scan_items.py_func(counted)  # type: ignore[attr-defined]
-    assert outcome == message_limits._scan_items(np.frombuffer(payload, np.uint8))
+    outcome = message_limits._scan_items.py_func(counted, *message_limits._make_containers())  # type: ignore[attr-defined]
+    assert outcome == message_limits._scan_items(np.frombuffer(payload, np.uint8), *message_limits._make_containers())
     assert counted.looks <= 5 * len(payload)
 
 

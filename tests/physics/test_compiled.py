@@ -37,7 +37,7 @@ print(float(result), hits, cache_directory())
 SMALL = PROBE.format(
     home="leakage",
     kernel="leakage_series",
-    call="result = leakage_series(np.full(3, 1e5), np.zeros(3), np.full(3, 1e-10), 2000.0)[0]",
+    call="Q = np.empty(3); leakage_series(np.full(3, 1e5), np.zeros(3), np.full(3, 1e-10), 2000.0, Q); result = Q[0]",
 )
 #: The solver itself, whose laws stand in six other files.
 WHOLE = """

@@ -125,5 +125,6 @@ def test_a_cap_pushes_back_only_and_only_in_contact(x, v):
 def test_leakage_adds_a_gap_and_an_orifice():
     both = piston_leakage(1e5, 6e-13, 2e-10, 2000.0)
     assert both == pytest.approx(6e-8 + 2e-10 * math.sqrt(1e5), rel=1e-3)
-    dp = np.array([-1e5, 0.0, 1e5])
-    np.testing.assert_allclose(leakage_series(dp, np.full(3, 6e-13), np.full(3, 2e-10), 2000.0), [-both, 0.0, both])
+    dp, Q_L = np.array([-1e5, 0.0, 1e5]), np.empty(3)
+    leakage_series(dp, np.full(3, 6e-13), np.full(3, 2e-10), 2000.0, Q_L)
+    np.testing.assert_allclose(Q_L, [-both, 0.0, both])

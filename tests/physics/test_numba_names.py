@@ -34,12 +34,13 @@ ATTRIBUTES = {
         *("save_overload", "flush", "cache_path"),
     ),
     "numba.core.codegen:JITCodeLibrary": (
-        *("_finalize_final_module", "_optimize_functions", "get_pointer_to_function"),
+        *("_finalize_final_module", "_optimize_functions", "enable_object_caching", "get_pointer_to_function"),
     ),
     "numba.core.compiler:CompilerBase": ("compile_extra", "define_pipelines"),
     "numba.core.compiler_machinery:PassManager": ("add_pass", "finalize"),
+    "numba.core.lowering:Lower": ("lower_getitem", "lower_setitem", "loadvar", "typeof"),
     "numba.core.registry:CPUDispatcher": ("add_overload", "compile"),
-    "numba.core.runtime:rtsys": ("initialize",),
+    "numba.core.typed_passes:BaseNativeLowering": ("lowering_class",),
     "numba.core.config": ("CACHE_DIR",),
 }
 
@@ -88,7 +89,9 @@ numba.__version__ = {version!r}
 from sealscope import compiled
 from sealscope.physics.leakage import leakage_series
 import numpy as np
-print(compiled._compiler().__name__, *leakage_series(np.full(3, 1e5), np.zeros(3), np.full(3, 1e-10), 2000.0))
+Q = np.empty(3)
+leakage_series(np.full(3, 1e5), np.zeros(3), np.full(3, 1e-10), 2000.0, Q)
+print(compiled._compiler().__name__, *Q)
 """
 SIMULATION = """
 import numba

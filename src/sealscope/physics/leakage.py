@@ -34,9 +34,7 @@ def piston_leakage(dp: float, G: float, C: float, dp_0: float) -> float:
 
 
 @kernel
-def leakage_series(dp: np.ndarray, G: np.ndarray, C: np.ndarray, dp_0: float) -> np.ndarray:
-    """Compute `piston_leakage` (n,) [m^3/s] for arrays `dp` [Pa], `G` [m^3/(s Pa)] and `C` [m^3/(s Pa^0.5)]."""
-    Q_L = np.empty(dp.size)
+def leakage_series(dp: np.ndarray, G: np.ndarray, C: np.ndarray, dp_0: float, Q_L: np.ndarray) -> None:
+    """Write `piston_leakage` [m^3/s] for n `dp` [Pa], `G` [m^3/(s Pa)] and `C` [m^3/(s Pa^0.5)] to `Q_L` (n,)."""
     for k in range(dp.size):
         Q_L[k] = piston_leakage(dp[k], G[k], C[k], dp_0)
-    return Q_L

@@ -318,6 +318,7 @@ class _Integration:
         from sealscope.physics.rig import pack_numbers
         from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, advance, advance_closed, step_nodes
         from sealscope.physics.solvers.limits import longest_step
+        from sealscope.physics.solvers.loop import SPACING
 
         h, load = 1.0 / (self.rate * n_steps), self.experiment.load
         euler = self.experiment.rig.motor.integrator == "euler"  # `euler_integral` of `rk4_step`
@@ -345,7 +346,9 @@ class _Integration:
                     advance(implicit, y, h, u[steps], *arguments, out)
                     self._check_rows(p, h, out, k)
                     continue
-                n_completed = advance_closed(implicit, y, h, *arguments, k, out, self.feedback.loop)
+                loop = self.feedback.loop
+                volts = np.empty((loop.counters[SPACING] * n_steps, len(nodes)))
+                n_completed = advance_closed(implicit, y, h, *arguments, k, out, loop, volts)
                 self._check_rows(p, h, out[:n_completed], k)
                 if n_completed < end - k:  # the controller failed
                     self.feedback.raise_failure()

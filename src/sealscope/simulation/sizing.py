@@ -33,8 +33,9 @@ def leak_flow(leak: Leak, t: Array, dp: Array, dp_0: float) -> Array:
     coefficient = (leak.coefficient or 0.0) * leak.opening.value_at(t)
     if leak.law == "laminar":
         return np.asarray(np.abs(laminar_leakage(dp, coefficient)))  # type: ignore[arg-type]
-    G = np.zeros_like(coefficient)
-    return np.asarray(np.abs(leakage_series(np.ascontiguousarray(dp), G, coefficient, dp_0)))
+    Q_L = np.empty_like(coefficient)
+    leakage_series(np.ascontiguousarray(dp), np.zeros_like(coefficient), coefficient, dp_0, Q_L)
+    return np.abs(Q_L)
 
 
 def mean_while_open(leak: Leak, t: Array, flow: Array) -> float:

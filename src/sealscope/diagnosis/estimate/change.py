@@ -663,7 +663,7 @@ def _build_whitening(
     if shape is not None:
         changes[2] = shape
     sums, gains = np.zeros_like(precision), np.zeros_like(changes)
-    n_removed = _project_out(precision, changes, priors, floor, sums, gains)
+    n_removed = _project_out(precision, changes, priors, floor, np.empty(count), sums, gains)
     eigen, vectors = np.linalg.eigh(sums)
     n = min(n_informative - n_removed, int(np.count_nonzero(eigen > ROUNDING * max(float(eigen[-1]), 0.0))))
     if n < 1:
@@ -692,16 +692,19 @@ def _build_whitening(
 
 
 @kernel
-def _project_out(precision: Array, changes: Array, priors: Array, floor: float, sums: Array, gains: Array) -> int:
+def _project_out(
+    precision: Array, changes: Array, priors: Array, floor: float, products: Array, sums: Array, gains: Array
+) -> int:
     """Eliminate m nuisance `changes` (m, K) from the `precision` (K, K) of a coefficient in K blocks, one by one.
 
     `priors` (m,): prior precisions of their sizes. A change x that the data cannot show, with x' Lambda x at most
     `floor` x' x beside the earlier ones, stays. Writes L' Lambda L of the remaining precision to `sums` (K, K), where L
     sums up the increments of the coefficient, and to `gains` (m, K) that of each change, with which its elimination
-    subtracts gain x' vector from the vector of the likelihood. Returns the number of values that are lost.
+    subtracts gain x' vector from the vector of the likelihood. `products` (K,) is scratch. Returns the number of values
+    that are lost.
     """
     n_changes, count = changes.shape
-    products, n_removed = np.empty(count), 0
+    n_removed = 0
     for i in range(count):
         for j in range(count):
             sums[i, j] = precision[i, j]
@@ -765,7 +768,7 @@ def _test_steps(
     total = np.maximum(weighted @ z, TINY)  # weighted sum of the values' squares, for each walk
     moments, tests = weighted @ steps.whole, list[StepTest]()
     for sign in signs:
-        courses, numbers = np.empty((3, len(onsets))), np.empty(9)
+        courses, by_walk, numbers = np.empty((4, len(onsets))), np.empty((2, len(weighted))), np.empty(9)
         _score_step(
             whitening.log_factor,
             whitening.walks,
@@ -779,6 +782,7 @@ def _test_steps(
             sign,
             n,
             courses,
+            by_walk,
             numbers,
         )
         score, best, *fitted, noise_without, noise_with, walk_without, walk_with, length = numbers.tolist()
@@ -814,22 +818,24 @@ def _score_step(
     sign: float,
     n: int,
     courses: Array,
+    by_walk: Array,
     numbers: Array,
 ) -> None:
     """Maximise the likelihoods of a step and of no step over the variances of walk and noise, for `_test_steps`.
 
     A step down is a step up of the values with the opposite sign. `moments` (w, K + 1): weighted products of the
     `_Steps.whole` with the values, for each walk; `total` (w,): those of the values with themselves. Writes to
-    `courses` (3, o) the log likelihood of a step at each onset, and its size, up or down, with its error for the
+    `courses` (4, o) the log likelihood of a step at each onset, and its size, up or down, with its error for the
     likeliest walk without a step; to `numbers` (9,) score, index of the best onset, size and error of the step there,
     variances of the noise and of the walk (one of `walks`), each without a step and with the best one, and the largest
-    length of the curve of the steps over the walks that the data allow.
+    length of the curve of the steps over the walks that the data allow. The last row of `courses`, and `by_walk` (2, w)
+    are scratch.
     """
     n_walks, n_onsets = inverse_energies.shape
     half = 0.5 * n
-    likelihood, size, deviation = courses
+    likelihood, size, deviation, gains = courses
+    without_likelihoods, with_likelihoods = by_walk
     without, largest_factor = 0, log_factor[0]
-    without_likelihoods, with_likelihoods = np.empty(n_walks), np.empty(n_walks)
     for walk in range(n_walks):
         without_likelihoods[walk] = log_factor[walk] - half * math.log(total[walk] / n)
         if without_likelihoods[walk] > without_likelihoods[without]:
@@ -843,7 +849,7 @@ def _score_step(
         inverse = inverse_energies[without, onset]
         size[onset] = moment * inverse
         deviation[onset] = math.sqrt(max(total[without] - moment * moment * inverse, 0.0) / n * inverse)
-    smallest, best_walk, best, gains = np.inf, 0, 0, np.empty(n_onsets)
+    smallest, best_walk, best = np.inf, 0, 0
     for walk in range(n_walks):
         scale, largest_gain = math.exp(2.0 / n * (largest_factor - log_factor[walk])), 0.0
         for onset in range(n_onsets):

@@ -172,8 +172,8 @@ class RateRegression:
             precision[:, ::-1].copy(),
             mean[:, ::-1].copy(),
         )
-        solution = np.empty((len(rows), 3))
-        _solve_rates(*system, rows, variance, freedom, 0 if quantum else N_ITERATIONS, solution)
+        solution, scratch = np.empty((len(rows), 3)), np.empty((choices.shape[1] + 1, choices.shape[1]))
+        _solve_rates(*system, rows, variance, freedom, 0 if quantum else N_ITERATIONS, scratch, solution)
         profile = prior - 0.5 * (m * np.log(variance) + solution[:, 0])
         rows = np.flatnonzero(profile > profile.max() - MAX_DECREASE)
         log_step, grid = 0.0, variance[rows]
@@ -183,7 +183,7 @@ class RateRegression:
             grid = np.maximum(np.exp(spread * VARIANCE_POINTS)[:, None] * grid, LEAST_DEVIATION**2).ravel()
             rows = np.tile(rows, len(VARIANCE_POINTS))
         solution = np.empty((len(rows), 3))
-        _solve_rates(*system, rows, grid, freedom, 0, solution)
+        _solve_rates(*system, rows, grid, freedom, 0, scratch, solution)
         logs = prior[rows] - 0.5 * (m * np.log(grid) + solution[:, 0]) + log_step
         weights = np.exp(logs - logs.max())
         best = int(weights.argmax())
@@ -227,6 +227,7 @@ def _solve_rates(
     variances: Any,
     freedom: float,
     n_iterations: int,
+    scratch: Any,
     solution: Any,
 ) -> None:
     """Solve the normal equations of k combinations of noise and columns, and write `solution` (k, 3).
@@ -235,9 +236,10 @@ def _solve_rates(
     `mean` (c, p): columns of a combination and priors of their coefficients, that of the rate the last; `rows` (k,):
     noise times c, plus combination; `variances` (k,): of the noise, replaced by the most probable in `n_iterations`.
     Written are the misfit with the log determinant of the matrix, and the rate's deviation and mean.
+    `scratch` (p + 1, p) is working memory.
     """
     n_choices, p = choices.shape
-    factor, right = np.empty((p, p)), np.empty(p)
+    factor, right = scratch, scratch[p]
     for k in range(len(rows)):
         noise, choice = divmod(rows[k], n_choices)
         products = gram[noise]

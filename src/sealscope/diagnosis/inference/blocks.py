@@ -611,6 +611,7 @@ def _fit_regression(
     offset_deviation: float,
     n_rows: float,
     sums: Any,
+    scratch: Any,
     fitted: Any,
 ) -> tuple[float, float]:
     """Fit the coefficients of an equation but the tested one, and the sensor offset, by Gauss-Newton steps.
@@ -619,7 +620,7 @@ def _fit_regression(
     one is no prior), whose means are 0 except for the last column's, the offset's error; `n_rows`: number of rows in
     all blocks; for the other arguments see `_sum_products`. Writes the last normal equations to `sums`, and to the rows
     of `fitted` (3, c) `coefficients`, `prior_precision` and `prior_moment` of `_EquationFit`; returns its `offset` and
-    `variance`.
+    `variance`. `scratch`: arrays (c, c), (c, c), (c,), (c,) and (K,) of working memory.
 
     The variance of a row weights the prior, and so determines the fit: both are found by iteration, until the variance
     changes by at most the fraction `TOLERANCE`, or for `MAX_ITERATIONS`. Rows that overlap are correlated, as if their
@@ -628,10 +629,10 @@ def _fit_regression(
     n_blocks, size, left = len(gram), len(deviations), columns[1]
     n_polynomials = polynomials.shape[1]
     last, offset, variance = size - n_polynomials, 0.0, 0.0  # `last`: constant of the offset's error
-    precision, factors, moment, scale = np.empty((size, size)), np.empty((size, size)), np.empty(size), np.empty(size)
-    tested = np.zeros(n_blocks)  # g in each block
+    precision, factors, moment, scale, tested = scratch  # tested: g in each block
     total = 0.0
     for k in range(n_blocks):
+        tested[k] = 0.0
         total += gram[k, left, left]
     min_variance = 1e-14 * total / n_rows  # rounding errors of the sums
     for iteration in range(_MAX_OFFSET_STEPS + 1):
@@ -764,7 +765,9 @@ def _fit_equation_once(blocks: Blocks, equation: int, roles: ColumnRoles, test: 
     drifts = np.hypot(magnitudes * roles.drift_rate[nuisance], roles.clock_drifts(total)[nuisance])  # in a minute
     deviations[:-1, 1:] = (drifts * (seconds / 60.0))[:, None]
     deviations[-1, 0] = offset_deviation if offset_deviation > 0.0 else np.inf
-    sums, fitted = _Sums.allocate(len(gram), deviations.size), np.empty((3, deviations.size))
+    size = deviations.size
+    sums, fitted = _Sums.allocate(len(gram), size), np.empty((3, size))
+    scratch = tuple(np.empty(shape) for shape in ((size, size), (size, size), size, size, len(gram)))
     columns, places = (test, roles.left, -1 if roles.bias is None else roles.bias), np.array(nuisance, np.int64)
     offset, variance = _fit_regression(
         np.ascontiguousarray(gram),  # numba compiles a function once for each layout of its arrays
@@ -775,6 +778,7 @@ def _fit_equation_once(blocks: Blocks, equation: int, roles: ColumnRoles, test: 
         offset_deviation,
         n_rows,
         sums,
+        scratch,
         fitted,
     )
     normal = sums.normal_equations(gram, roles.left)

@@ -53,7 +53,7 @@ class MessageLimit(ValueError):  # noqa: N818 (names what is exceeded)
 
 def check_cbor(payload: bytes) -> int:
     """Check the items of a CBOR message; return the number of key-value pairs, or raise MessageLimit."""
-    code, position, n_pairs = _scan_items(np.frombuffer(payload, dtype=np.uint8))
+    code, position, n_pairs = _scan_items(np.frombuffer(payload, dtype=np.uint8), *_make_containers())
     if code != _NO_FAULT:
         raise MessageLimit(f"{_RULES[code]} (byte {position})", oversized=code == _LONG_LIST)
     return int(n_pairs)
@@ -157,18 +157,24 @@ def _skip_pieces(data: Any, start: int, position: int, major: int, n_texts: int)
         position += number
 
 
+def _make_containers() -> Any:
+    """Make the arrays of `_scan_items` for the container at each depth.
+
+    They are the number of items still to come, negative if unknown; 0 in a list, 1 before a key and 2 before a value of
+    a mapping; and the number of items so far.
+    """
+    return np.zeros((3, MAX_DEPTH + 1), dtype=np.int64)
+
+
 @kernel
-def _scan_items(data: Any) -> tuple[int, int, int]:
+def _scan_items(data: Any, n_left: Any, role: Any, n_items: Any) -> tuple[int, int, int]:
     """Check the number, depth and types of the items of a CBOR message, given as bytes (n,), in one pass.
 
+    `n_left`, `role`, `n_items`: of the container at each depth (`_make_containers`).
     Returns the index in `_RULES` of the first broken rule (0 for none), the index of the byte at which the fault or the
     end of the message lies, and the number of key-value pairs before it.
     """
-    # for the container at each depth: `n_left` is the number of items still to come, negative if unknown; `role` is 0
-    # in a list, 1 before a key and 2 before a value of a mapping; `n_items` is the number of items so far
     size, position, depth = len(data), 0, 0
-    n_left, role = np.zeros(MAX_DEPTH + 1, dtype=np.int64), np.zeros(MAX_DEPTH + 1, dtype=np.int64)
-    n_items = np.zeros(MAX_DEPTH + 1, dtype=np.int64)
     n_containers, n_pairs, n_texts, is_tagged = 0, 0, 0, False
     while True:
         while depth > 0 and n_left[depth] == 0:

@@ -76,14 +76,15 @@ def advance_closed(
     start: int,
     rows: np.ndarray,
     loop: Loop,
+    u: np.ndarray,
 ) -> int:
     """Integrate a run, or a part of it, whose voltage the controller `loop` sets; return the number of outputs written.
 
-    `start`: number of the output in rows[0], counted from the beginning of the run; other arguments: as in `advance`.
+    `start`: number of the output in rows[0], counted from the beginning of the run; `u`: scratch for the voltages of a
+    sample of the controller; other arguments: as in `advance`.
     If the controller returns a voltage that is not finite, the integration stops there, with fewer outputs.
     """
     spacing, n_rows = loop.counters[SPACING], rows.shape[0]  # outputs per sample of the controller; all outputs
-    u = np.empty((spacing * every, G.shape[1]))
     first = 0  # first row that is not yet written
     while first < n_rows:
         k = (start + first) // spacing  # the controller's sample

@@ -102,9 +102,13 @@ def add_to_rows(unfinished: Any, increments: Any, k: int, n_stride: int, peak: f
 
 
 @kernel
-def _integrate(increments: Any, n_stride: int, peak: float, unfinished: Any, values: Any, is_whole: Any) -> None:
-    """Write the rows (r, c) of `increments` (c, n), and flag those without a missing sample; others are zeros."""
-    present = np.empty(len(increments))
+def _integrate(
+    increments: Any, n_stride: int, peak: float, present: Any, unfinished: Any, values: Any, is_whole: Any
+) -> None:
+    """Write the rows (r, c) of `increments` (c, n), and flag those without a missing sample; others are zeros.
+
+    `present` (c,) is scratch; `unfinished` (SPAN, c) as in `add_to_rows`.
+    """
     for k in range((len(values) + SPAN - 1) * n_stride if len(values) else 0):
         for j in range(len(increments)):
             present[j] = increments[j, k]
@@ -135,7 +139,8 @@ def weak_form_rows(increments: Sequence[Array], rate: float) -> Rows:
     n_stride, columns = stride_samples(rate), np.stack(increments)
     n_rows = max(0, columns.shape[1] // n_stride - SPAN + 1)
     values, is_whole = np.zeros((n_rows, len(increments))), np.ones(n_rows, dtype=bool)
-    _integrate(columns, n_stride, peak_weight(rate), np.zeros((SPAN, len(increments))), values, is_whole)
+    present, unfinished = np.empty(len(increments)), np.zeros((SPAN, len(increments)))
+    _integrate(columns, n_stride, peak_weight(rate), present, unfinished, values, is_whole)
     time = (np.arange(n_rows, dtype=float) + 0.5 * SPAN) * n_stride / rate
     return Rows(time, values, is_whole)
 
