@@ -54,8 +54,8 @@ MAX_BLOCK_TIME: float = INFERENCE.blocks.longest
 MIN_BLOCK_TIME: float = INFERENCE.blocks.shortest
 #: Number of samples whose increments are computed together, so that they stay in the processor's cache.
 BATCH_SAMPLES = 8192
-#: Samples by channel, and the index of the first one, counted from the beginning of a stream.
-Piece = tuple[dict[str, Array], int]
+#: Samples by channel, their signals, and the index of the first one, counted from the beginning of a stream.
+Piece = tuple[dict[str, Array], Signals, int]
 
 
 class BlockStream(SavedAttributes):
@@ -228,12 +228,14 @@ class BlockStream(SavedAttributes):
         """Add the blocks `first` to `end` - 1 to what is known of the pump's flow: its sign, and an open circuit.
 
         A flow without a sign counts with one from the first blocks on that show the piston moving both ways. Returns
-        the samples of `_with_margins`, None if the sign of their flow no longer holds.
+        the samples of `_with_margins`, None if the sign of their flow no longer holds. Of an angle in a closed circuit
+        there is nothing to learn.
         """
+        if self._flow_channel not in UNSIGNED and not self._feeds_one_chamber:
+            return self._with_margins(samples, first, end)
         (balance,) = self._balances
         was_unsigned, feed_before = self.is_unsigned, self._feed_sums.find_feed(balance.area_ratio)
-        piece, begin = self._with_margins(samples, first, end)
-        signals = self._signals(piece)
+        piece, signals, begin = self._with_margins(samples, first, end)
         span = slice(first * self._length - begin, end * self._length - begin)
         self._feed_sums = self._feed_sums.add(FeedSums.measure(balance, signals, span))
         recorded = samples[self._flow_channel][first * self._length - self._first : end * self._length - self._first]
@@ -250,7 +252,7 @@ class BlockStream(SavedAttributes):
             self._used_balances = (feed_one_chamber(balance, feed),)
         feeds_as_before = not self._feeds_one_chamber or feed == feed_before
         self.n_meanings += self.is_unsigned != was_unsigned or not feeds_as_before
-        return None if was_unsigned or self.is_unsigned else (piece, begin)
+        return None if was_unsigned or self.is_unsigned else (piece, signals, begin)
 
     @property
     def is_unsigned(self) -> bool:
@@ -331,7 +333,7 @@ class BlockStream(SavedAttributes):
         )
 
     def _with_margins(self, samples: Mapping[str, Array], first: int, end: int) -> Piece:
-        """Select the samples on which the blocks `first` to `end` - 1 depend; also return the index of the first one.
+        """Select the samples on which the blocks `first` to `end` - 1 depend.
 
         The test functions of the last rows extend beyond the last block, and speeds and rests beyond these.
         """
@@ -343,7 +345,7 @@ class BlockStream(SavedAttributes):
             lowered = without_lowering(piece, self._rate, self._balances[0], self._lowering_limits)
             self.has_lowered |= any(lowered[name] is not values for name, values in piece.items())
             piece = lowered
-        return piece, begin
+        return piece, self._signals(piece), begin
 
     def _compute_rows(
         self, samples: Mapping[str, Array], first: int, end: int, piece: Piece | None
@@ -361,8 +363,7 @@ class BlockStream(SavedAttributes):
         """
         length = self._length
         start, stop = first * length, end * length + (SPAN - 1) * self._stride + 1
-        channels, begin = piece or self._with_margins(samples, first, end)
-        signals = self._signals(channels)
+        channels, signals, begin = piece or self._with_margins(samples, first, end)
         if self._feeds_one_chamber:
             circulates = flag_circulation(self._balances[0], signals, self._feed_sums.mean_flow)
             if circulates.any():

@@ -76,8 +76,9 @@ def sorted_part_means(pressure: Array, rate: float) -> Array:
         # not by BLAS (@), whose rounding depends on the number of threads
         noise_variance = float((differences**2).sum()) / max(len(differences), 1) / noise_gain
         n_complete = np.isfinite(mean).sum(axis=1, keepdims=True)  # pieces without a missing sample in each stride
-        squares = np.nansum(deviation**2, axis=(1, 2), keepdims=True)
-        variance = squares / (np.maximum(n_complete, 1) * (piece - 1))
+        squares = deviation**2
+        squares[np.isnan(squares)] = 0.0
+        variance = squares.sum(axis=(1, 2), keepdims=True) / (np.maximum(n_complete, 1) * (piece - 1))
         min_variance = max(noise_variance, np.finfo(float).tiny)  # a smaller variance is all noise: the factor is 0
         deviation *= np.sqrt(1.0 - noise_variance / np.maximum(variance, min_variance))
     values = (mean + deviation).ravel()
@@ -97,6 +98,12 @@ UNSTEADY = ("piston", "pump", "bias", "outside")
 #: Maximum number of Gauss-Newton steps to the offset of p_A - p_B.
 _MAX_OFFSET_STEPS = 3
 _TINY = float(np.finfo(float).tiny)
+
+
+@lru_cache(maxsize=16)
+def _upper_triangle(size: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the indices of the upper triangle of a matrix (`size`, `size`)."""
+    return np.triu_indices(size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,11 +146,11 @@ class Blocks:
 
     def pack(self) -> Blocks:
         """Return the blocks for storage, with only the upper triangles of `gram`, shape (K, E, m (m + 1) / 2)."""
-        return replace(self, gram=self.gram[..., *np.triu_indices(self.gram.shape[-1])])
+        return replace(self, gram=self.gram[..., *_upper_triangle(self.gram.shape[-1])])
 
     def unpack(self, size: int) -> Blocks:
         """Restore the Gram matrices (`size`, `size`) after `pack`; raise InputError if the stored shapes do not fit."""
-        upper, lower = np.triu_indices(size)
+        upper, lower = _upper_triangle(size)
         lengths = {len(getattr(self, name)) for name in self.__dataclass_fields__}
         if self.gram.shape[2:] != upper.shape or lengths != {len(self.start)}:
             raise InputError(f"saved state's gram must have {len(upper)} sums in each block, got {self.gram.shape}")

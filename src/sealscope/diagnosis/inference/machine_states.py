@@ -27,7 +27,7 @@ from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.motion import find_runs
 from sealscope.recordings.recording import Array
-from sealscope.signals.smoothing import average_over
+from sealscope.signals.smoothing import average_over, medians, quantiles
 
 #: Averaging time of the speeds from which rests (standstills) are found, and minimum length of a rest [s].
 AVERAGING_TIME, MIN_REST = INFERENCE.rest.averaging_time, INFERENCE.rest.shortest
@@ -154,11 +154,11 @@ def _speed_and_noise(increments: Array, rate: float) -> tuple[float, float]:
     # sixth differences of white noise have 924 times its variance; every second value only, since neighbouring
     # increments share a sample
     differences = np.abs(np.diff(velocity[::2], 6))
-    noise = SD_PER_MEDIAN * float(np.median(differences)) / math.sqrt(924.0) if len(differences) else 0.0
+    noise = SD_PER_MEDIAN * float(medians(differences)) / math.sqrt(924.0) if len(differences) else 0.0
     del differences
     speed = np.abs(velocity, out=velocity)
     if speed.size:
-        np.minimum(speed, np.quantile(speed, SPEED_QUANTILE), out=speed)
+        np.minimum(speed, quantiles(speed, SPEED_QUANTILE)[0], out=speed)
     mean_speed = float(speed @ speed) / max(float(speed.sum()), np.finfo(float).tiny)
     return mean_speed, noise
 
@@ -195,7 +195,7 @@ def find_lowering_limits(pump_volume: Array, x: Array, pressure_difference: Arra
     return LoweringLimits(
         pump=max_flow,
         creep=_limit_of_rest(*speed_and_noise, rate, INFERENCE.rest.lowering_speed),
-        load=float(np.median(load)) if load.size else 0.0,
+        load=float(medians(load)) if load.size else 0.0,
         noise=_limit_of_rest(*speed_and_noise, rate, fraction=0.0),
         time=len(load) / rate,
     )
@@ -214,11 +214,23 @@ def flag_lowering(
     flags reach `AVERAGING_TIME`, over which speeds are averaged, beyond either end.
 
     `pump_volume` (n,): increments of the pump's volume [m^3], NaN where missing; `x` (n + 1,): position [m];
-    `pressure_difference` (n,): p_A - p_B [Pa] in the middle of each sampling interval, which is overwritten; `rate`:
-    sampling rate [Hz]; `limits`: by default those of the same samples.
+    `pressure_difference` (n,): p_A - p_B [Pa] in the middle of each sampling interval, which may be
+    overwritten; `rate`: sampling rate [Hz]; `limits`: by default those of the same samples.
     """
     limits = limits or find_lowering_limits(pump_volume, x, pressure_difference, rate)
     rests = find_rests(pump_volume, rate, limits.pump)
+    margin = math.ceil(AVERAGING_TIME * rate)
+
+    def extend_both_ways(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Flag `margin` more samples at either end of each run of flags."""
+        return extend_flags(flags, 2 * margin + 1)[margin:-margin]
+
+    is_turning = extend_both_ways(~rests)  # averages next to motion contain some of it
+    window = min(max(1, round(MIN_REST * rate)), len(rests))  # [samples]
+    # windows after each sample in which the pump rests; without one nothing is lowered
+    is_free = _window_sums(is_turning.view(np.int8), window) == 0
+    if not is_free.any():
+        return np.zeros(len(rests), dtype=bool)
     usual_load = max(limits.load, np.finfo(float).tiny)
     # arrays are changed in place: a long recording has few copies
     relative_load = np.abs(pressure_difference, out=pressure_difference)
@@ -238,17 +250,7 @@ def flag_lowering(
     np.abs(excess, out=excess)
     excess -= limit
     del velocity, limit
-    margin = math.ceil(AVERAGING_TIME * rate)
-
-    def extend_both_ways(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Flag `margin` more samples at either end of each run of flags."""
-        return extend_flags(flags, 2 * margin + 1)[margin:-margin]
-
-    is_turning = extend_both_ways(~rests)  # averages next to motion contain some of it
-    window = min(max(1, round(MIN_REST * rate)), len(rests))  # [samples]
-    # on average over the window after each sample, in which the pump rests
-    is_free = _window_sums(excess, window) > 0.0
-    is_free &= _window_sums(is_turning.view(np.int8), window) == 0
+    is_free &= _window_sums(excess, window) > 0.0  # on average over the window
     is_lowering = ~is_turning & (excess > 0.0) & extend_flags(is_free, window)
     for first, length in find_runs(~is_lowering).tolist():
         if length < INFERENCE.rest.shortest_hold * rate and not is_turning[first : first + length].any():

@@ -8,9 +8,10 @@ the duty (motion and load) caused it is computed as for a recording, from the sa
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sealscope.diagnosis.decision.explanations import LEAK_EVENTS, explain, load_events, probability_of
 from sealscope.diagnosis.estimate.interval import Interval
@@ -144,7 +145,9 @@ class SignalWindow(SavedAttributes):
         features = [float(values[name][0]) if name in values else np.nan for name in FEATURES]
         n_samples, gram = len(channels["p_A"]), design.T @ design
         row = np.array([begin, begin + n_samples / rate, n_samples, speed, fraction_moving, *features, *gram.ravel()])
-        self._rows = append_row(self._rows, row)
+        # rows of another length are of other channels: they are dropped
+        rows = self._rows if self._rows.shape[1:] == row.shape else np.empty((0, len(row)))
+        self._rows = append_row(rows, row, WINDOW)
 
     @np.errstate(all="ignore")
     def observables(self, since: float) -> tuple[Observable, ...]:
@@ -187,10 +190,9 @@ class SignalWindow(SavedAttributes):
         return ()
 
 
-def append_row(rows: Array, row: Array) -> Array:
-    """Append the `row` of a block to the last `WINDOW` - 1 of the `rows`.
-
-    If the rows have another length, there are none yet, or they are of other channels: they are dropped.
-    """
-    stored = rows[1 - WINDOW :] if rows.shape[1:] == row.shape else np.empty((0, len(row)))
-    return np.vstack([stored, row])
+def append_row(rows: NDArray[Any], row: NDArray[Any], most: int) -> NDArray[Any]:
+    """Append the `row` of a block to the last `most` - 1 of the `rows`, of the same type and shape."""
+    stored = rows[1 - most :]
+    appended = np.empty((len(stored) + 1, *rows.shape[1:]), rows.dtype)
+    appended[:-1], appended[-1] = stored, row
+    return appended

@@ -58,6 +58,10 @@ class AngleUnwrapper(SavedAttributes):
         known = values[rows]
         first = known[0] if math.isnan(self.last) else self.last
         steps = np.diff(known, prepend=first)
+        if rows.size == values.size and not self.missing and np.abs(steps).max() <= 0.5 * _TURN:  # the usual case
+            self.low, self.high = min(self.low, float(known.min())), max(self.high, float(known.max()))
+            self.last, self.step = float(known[-1]), float(steps[-1])
+            return (values + _TURN * self.turns if self.turns else values), 0
         counts = np.diff(rows, prepend=-1 - self.missing)  # intervals from one to the next
         low = np.minimum(np.minimum.accumulate(known), self.low)
         high = np.maximum(np.maximum.accumulate(known), self.high)

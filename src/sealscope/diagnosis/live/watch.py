@@ -31,7 +31,7 @@ from sealscope.diagnosis.live.estimates import (
     level_before_leak,
     mean_flow,
 )
-from sealscope.diagnosis.live.explanation import OUTSIDE, UNKNOWN, RiseExplanation, explain_rise
+from sealscope.diagnosis.live.explanation import OUTSIDE, UNKNOWN, RiseExplanation, append_row, explain_rise
 from sealscope.diagnosis.live.joining import SampleJoiner, find_way
 from sealscope.diagnosis.live.live_balance import LEARNED, BlockConductance, BlockResult, LiveBalance, NotJudged
 from sealscope.diagnosis.live.sequential import LEVEL, RECENT, STEP, LiveRise, StepDetector, StepNull
@@ -373,7 +373,7 @@ class Watch:
         if not len(self._compared):
             self._since = block.begin
         self._detector.take(block.begin, block.end, block.g, block.sd)
-        self._compared = np.append(self._compared[1 - RECENT :], np.array([block], _BLOCK))  # the last `RECENT` blocks
+        self._compared = append_row(self._compared, np.array(block, _BLOCK), RECENT)
 
     def _learn(self, block: BlockConductance) -> None:
         """Add a block to the baseline; freeze it after `learn_hours` of operation, but at least `LEARNED` blocks."""

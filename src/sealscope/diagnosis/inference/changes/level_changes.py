@@ -42,7 +42,7 @@ from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording
-from sealscope.signals.smoothing import TINY
+from sealscope.signals.smoothing import TINY, quantiles
 
 _PRIORS = CHANGES.levels
 #: Most samples whose rows are computed together.
@@ -110,7 +110,8 @@ def _half_length(rate: float) -> int:
 
 def top_speed(speed: Array) -> float:
     """Compute the 99 % quantile of the magnitude of a speed (n,), NaN where missing."""
-    return max(float(np.nanpercentile(np.abs(speed), 99.0)), TINY)
+    magnitudes = np.abs(speed)
+    return max(float(quantiles(magnitudes[~np.isnan(magnitudes)], 0.99)[0]), TINY)
 
 
 def estimate_levels(recording: Recording) -> tuple[Array, Array] | None:
@@ -194,9 +195,11 @@ def pressure_level_rows(
         np.subtract(channels[name], mean, out=rows[:, 1 + n_motion + place])
     if motion is None:
         return rows
-    is_known = np.asarray(np.isfinite(motion).all(axis=1))
-    motion[~is_known] = 0.0
-    is_moving = is_known & (np.abs(motion[:, 0]) > _PRIORS.slowest * max_speed)
+    is_moving = np.abs(motion[:, 0]) > _PRIORS.slowest * max_speed
+    if not np.isfinite(motion).all():
+        is_known = np.isfinite(motion).all(axis=1)
+        motion[~is_known] = 0.0
+        is_moving &= is_known
     np.sign(motion[:, 0], out=rows[:, 1])
     rows[:, 2 : 1 + n_motion] = motion
     rows *= is_moving[:, None]

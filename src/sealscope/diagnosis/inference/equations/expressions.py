@@ -17,7 +17,7 @@ import ast
 import linecache
 import math
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
+from functools import cache, partial
 from itertools import count
 from typing import Any
 
@@ -65,57 +65,90 @@ def channels_of(text: str) -> frozenset[str]:
 @cache
 def increments_of(text: str, displacement: float = 1.0) -> Callable[[Signals], Array]:
     """Return a function that evaluates an expression over all sampling intervals of `Signals`, shape (n - 1,)."""
-    tree = parse_expression(text)
+    evaluate = _over_intervals(parse_expression(text), displacement)
 
     def increments(signals: Signals) -> Array:
         """Evaluate the expression."""
-        values = _interval_values(tree, signals, displacement)
+        values = evaluate(signals)
         return np.asarray(values) if np.ndim(values) else np.full(len(signals.time_step), values)
 
     return increments
 
 
-def _interval_values(node: ast.expr, s: Signals, displacement: float) -> Any:
-    """Evaluate an expression over the sampling intervals (n - 1,)."""
+#: Evaluates a part of an expression, over the sampling intervals (n - 1,) or at the samples (n,) of `Signals`.
+_Evaluate = Callable[[Signals], Any]
+
+
+def _over_intervals(node: ast.expr, displacement: float) -> _Evaluate:
+    """Build the function that evaluates an expression over the sampling intervals (n - 1,)."""
     if isinstance(node, ast.Constant):
-        return float(node.value)  # type: ignore[arg-type]
+        return _constant(node)
     if isinstance(node, ast.BinOp):
-        left, right = (_interval_values(side, s, displacement) for side in (node.left, node.right))
-        operator = _OPERATORS[type(node.op)]  # type: ignore[index]
-        return {"+": np.add, "-": np.subtract, "*": np.multiply, "/": np.divide}[operator](left, right)
+        return _binary(node, *(_over_intervals(side, displacement) for side in (node.left, node.right)))
     if isinstance(node, ast.Name):
         if node.id in DIRECTIONS:
-            return np.where(np.isnan(interval_means(s.speed)), np.nan, s.direction_weights(*DIRECTIONS[node.id]))
-        if node.id == "pressure_difference":
-            return s.pressure_difference
-        return {"dt": s.dt, "rate": s.rate, "displacement": displacement}[node.id]
+            return partial(_direction, *DIRECTIONS[node.id])
+        words: dict[str, _Evaluate] = {
+            "pressure_difference": lambda s: s.pressure_difference,
+            "dt": lambda s: s.dt,
+            "rate": lambda s: s.rate,
+            "displacement": lambda _: displacement,
+        }
+        return words[node.id]
     name, value = _call(node)
     if name == "gradient":
-        return np.gradient(_interval_values(value, s, displacement))
+        rates = _over_intervals(value, displacement)
+        return lambda s: np.gradient(rates(s))
     if isinstance(value, ast.Name):
-        return s.step(value.id) if name == "change" else s.mean(value.id)
-    points = _point_values(value, s)
-    return np.diff(points) if name == "change" else 0.5 * (points[1:] + points[:-1])
+        channel = value.id
+        return (lambda s: s.step(channel)) if name == "change" else (lambda s: s.mean(channel))
+    points, combine = _at_samples(value), np.diff if name == "change" else interval_means
+    return lambda s: combine(points(s))
 
 
-def _point_values(node: ast.expr, s: Signals) -> Any:
-    """Evaluate an expression at the samples (n,)."""
+def _at_samples(node: ast.expr) -> _Evaluate:
+    """Build the function that evaluates an expression at the samples (n,)."""
     if isinstance(node, ast.Constant):
-        return float(node.value)  # type: ignore[arg-type]
+        return _constant(node)
     if isinstance(node, ast.Name):
-        return s[node.id]
+        channel = node.id
+        return lambda s: s[channel]
     if isinstance(node, ast.BinOp):
-        left, right = _point_values(node.left, s), _point_values(node.right, s)
-        operator = _OPERATORS[type(node.op)]  # type: ignore[index]
-        return {"+": np.add, "-": np.subtract, "*": np.multiply, "/": np.divide}[operator](left, right)
+        return _binary(node, _at_samples(node.left), _at_samples(node.right))
     name, value = _call(node)
     if name == "absolute":
         assert isinstance(value, ast.Name)
-        return s.absolute_pressure[value.id]
-    points = np.asarray(_point_values(value, s))
-    logarithms = np.empty(points.shape)
-    _take_logarithms(points, logarithms)
-    return logarithms
+        pressure = value.id
+        return lambda s: s.absolute_pressure[pressure]
+    points = _at_samples(value)
+
+    def logarithm(s: Signals) -> Array:
+        """Compute the logarithm at each sample."""
+        values = np.asarray(points(s))
+        logarithms = np.empty(values.shape)
+        _take_logarithms(values, logarithms)
+        return logarithms
+
+    return logarithm
+
+
+def _constant(node: ast.Constant) -> _Evaluate:
+    """Build the function that returns a number."""
+    number = float(node.value)  # type: ignore[arg-type]
+    return lambda _: number
+
+
+def _binary(node: ast.BinOp, left: _Evaluate, right: _Evaluate) -> _Evaluate:
+    """Build the function that applies an operator to the values of both sides."""
+    operator = {"+": np.add, "-": np.subtract, "*": np.multiply, "/": np.divide}[_OPERATORS[type(node.op)]]  # type: ignore[index]
+    return lambda s: operator(left(s), right(s))
+
+
+def _direction(outward: bool, by_A: bool, s: Signals) -> Array:
+    """Return the weights of a direction of motion with the side that carries the load, NaN without a known speed."""
+    weights = s.direction_weights(outward, by_A)
+    weights[s.unknown_motion] = np.nan
+    return weights
 
 
 @kernel

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from functools import cache, cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sealscope.diagnosis.inference.machine_states import MachineStates, RestLimits, find_states
 from sealscope.diagnosis.priors.inference import INFERENCE
@@ -108,6 +109,11 @@ class Signals:
         """
         return (self._channels["p_A"] > self._channels["p_B"] + self._offset).astype(float)
 
+    @cached_property
+    def unknown_motion(self) -> NDArray[np.intp]:
+        """Indices of the intervals at either end of which the speed is missing."""
+        return np.flatnonzero(np.isnan(interval_means(self.speed)))
+
     def direction_weights(self, outward: bool, by_A: bool) -> Array:
         """Return 1 for each interval (n - 1,) of motion in a given direction while a given side carries the load.
 
@@ -147,7 +153,8 @@ def central_difference(values: Array, half_width: int) -> Array:
 
     It is not divided by the time. Beyond the ends the first and last values are repeated.
     """
-    padded = np.concatenate([np.repeat(values[:1], half_width), values, np.repeat(values[-1:], half_width)])
+    padded = np.empty(len(values) + 2 * half_width)
+    padded[:half_width], padded[half_width:-half_width], padded[-half_width:] = values[:1], values, values[-1:]
     return np.asarray(padded[2 * half_width :] - padded[: -2 * half_width])
 
 
