@@ -51,6 +51,13 @@ class AngleUnwrapper(SavedAttributes):
 
     def unwrap(self, values: Array) -> tuple[Array, int]:
         """Return the next angles (n,) [rad] without wraps, and the number of wraps; missing values (NaN) stay so."""
+        steps = np.diff(values)
+        first_step = 0.0 if math.isnan(self.last) else float(values[0]) - self.last
+        # the usual case: no step may be a wrap (False with a missing value)
+        if abs(first_step) <= 0.5 * _TURN and np.abs(steps).max(initial=0.0) <= 0.5 * _TURN and not self.missing:
+            self.low, self.high = min(self.low, float(values.min())), max(self.high, float(values.max()))
+            self.last, self.step = float(values[-1]), float(steps[-1]) if len(steps) else first_step
+            return (values + _TURN * self.turns if self.turns else values), 0
         rows = np.flatnonzero(np.isfinite(values))
         if not rows.size:
             self.missing += values.size
@@ -58,10 +65,6 @@ class AngleUnwrapper(SavedAttributes):
         known = values[rows]
         first = known[0] if math.isnan(self.last) else self.last
         steps = np.diff(known, prepend=first)
-        if rows.size == values.size and not self.missing and np.abs(steps).max() <= 0.5 * _TURN:  # the usual case
-            self.low, self.high = min(self.low, float(known.min())), max(self.high, float(known.max()))
-            self.last, self.step = float(known[-1]), float(steps[-1])
-            return (values + _TURN * self.turns if self.turns else values), 0
         counts = np.diff(rows, prepend=-1 - self.missing)  # intervals from one to the next
         low = np.minimum(np.minimum.accumulate(known), self.low)
         high = np.maximum(np.maximum.accumulate(known), self.high)

@@ -177,6 +177,7 @@ class LiveBalance(SavedAttributes):
         needed_names = {"x", "p_A", "p_B", flow_source(names)}
         needed_names |= {name for balance in self._balances for term in balance.terms for name in term.needs}
         self.names = tuple(name for name in names if name in needed_names)  # channels that the balances read
+        self._limits = [sensor_limit(CHANNEL_UNITS[name]) for name in self.names]  # beyond which a reading is none
         self.size_error = size_error(rig)  # relative standard error of all flows, and that of a leak's flow
         self.leak_error = math.hypot(self.size_error, LIVE.watch.law)
         self._roles = tuple(map(ColumnRoles, self._balances))
@@ -232,11 +233,11 @@ class LiveBalance(SavedAttributes):
     def _mark_missing(self, channels: Mapping[str, Array]) -> dict[str, Array]:
         """Select the channels in use, NaN in each sample that lacks one of them or has a value that no sensor reads."""
         selected = {name: channels[name] for name in self.names}
-        is_present = np.logical_and.reduce(
-            [np.abs(values) <= sensor_limit(CHANNEL_UNITS[name]) for name, values in selected.items()]
-        )
-        if is_present.all():
+        if all(np.abs(values).max() <= limit for values, limit in zip(selected.values(), self._limits, strict=True)):
             return selected
+        is_present = np.logical_and.reduce(
+            [np.abs(values) <= limit for values, limit in zip(selected.values(), self._limits, strict=True)]
+        )
         return {name: np.where(is_present, values, np.nan) for name, values in selected.items()}
 
     def _make_stream(self) -> BlockStream:

@@ -57,7 +57,7 @@ def remove_dropouts(recording: Recording) -> Recording:
     if len(chambers_of(recording)) < 2:
         return recording
     is_dropout = (recording["p_A"] == 0.0) & (recording["p_B"] == 0.0)
-    return set_missing(recording, dict.fromkeys(recording.channels, is_dropout))
+    return set_missing(recording, dict.fromkeys(recording.channels, is_dropout)) if is_dropout.any() else recording
 
 
 def remove_unsupplied(recording: Recording) -> Recording:

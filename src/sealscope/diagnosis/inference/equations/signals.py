@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import cache, cached_property
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +26,6 @@ class Signals:
     - `to_absolute`: absolute minus gauge pressure [Pa] by channel, by default atmospheric pressure;
     - `offset`: sensor offset [Pa] that is subtracted from p_A - p_B;
     - `rest_limits`: speeds below which the machine rests, None to find no rests.
-
-    `step(name)` gives the differences of neighbouring samples, and `mean(name)` their means, (n - 1,) each.
     """
 
     def __init__(
@@ -41,14 +39,26 @@ class Signals:
         self._channels, self.rate, self._to_absolute, self._offset = channels, rate, to_absolute or {}, offset
         self._rest_limits = rest_limits
         self._states: MachineStates | None = None
-        self.step = cache(lambda name: np.asarray(np.diff(channels[name])))
-        self.mean = cache(lambda name: interval_means(channels[name]))
+        self._steps, self._means = dict[str, Array](), dict[str, Array]()
 
     def __contains__(self, name: object) -> bool:
         return name in self._channels
 
     def __getitem__(self, name: str) -> Array:
         return self._channels[name]
+
+    def step(self, name: str) -> Array:
+        """Return the differences (n - 1,) of neighbouring samples of a channel, which are kept."""
+        if name not in self._steps:
+            values = self._channels[name]
+            self._steps[name] = values[1:] - values[:-1]
+        return self._steps[name]
+
+    def mean(self, name: str) -> Array:
+        """Return the means (n - 1,) of neighbouring samples of a channel, which are kept."""
+        if name not in self._means:
+            self._means[name] = interval_means(self._channels[name])
+        return self._means[name]
 
     @property
     def dt(self) -> float:
