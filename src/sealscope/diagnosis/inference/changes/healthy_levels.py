@@ -146,7 +146,8 @@ class HealthyLevels:
     def learn(self, recording: Recording) -> LevelSummary | None:
         """Summarise a recording by friction, drifts and spectra; None if nothing can be estimated."""
         nothing = (None, None)
-        fit, motion, drifts, zero = fit_difference(recording), select_motion(recording), dict[str, Estimate](), None
+        motion, drifts, zero = select_motion(recording), dict[str, Estimate](), None
+        fit = fit_difference(recording, motion)
         if motion is not None:
             # residuals may be correlated within a stroke
             drifts = {

@@ -31,6 +31,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
@@ -143,7 +144,7 @@ def estimate_levels(recording: Recording) -> tuple[Array, Array] | None:
 
 
 class _LevelGrams:
-    """Gram matrices of the `pressure_level_rows` of a recording, some blocks at a time: all rows are many.
+    """Gram matrices of the `pressure_level_rows` of a recording; many rows are computed some blocks at a time.
 
     `means` (2,) [Pa]: means of the pressures.
     """
@@ -166,15 +167,27 @@ class _LevelGrams:
 
     def blocks(self, count: int, length: int) -> Array:
         """Compute the Gram matrices (count, m, m) of the first `count` blocks of `length` samples."""
+        if self._all_rows is not None:
+            rows = self._all_rows[: count * length].reshape(count, length, -1)
+            return np.asarray(rows.transpose(0, 2, 1) @ rows)
         size, grams = max(1, _STRETCH // length), list[Array]()
         for first in range(0, count, size):
             last = min(first + size, count)
             begin = max(0, first * length - self._margin)
             part = {name: values[begin : last * length + self._margin] for name, values in self._channels.items()}
-            rows = pressure_level_rows(part, self._rate, self._means, self._max_speed, self._mean_position)
+            rows = self._compute_rows(part)
             blocks = rows[first * length - begin :][: (last - first) * length].reshape(last - first, length, -1)
             grams.append(blocks.transpose(0, 2, 1) @ blocks)
         return np.concatenate(grams)
+
+    @cached_property
+    def _all_rows(self) -> Array | None:
+        """Rows of all samples, on which several lengths of blocks are tried; None for a long recording."""
+        return self._compute_rows(self._channels) if len(self._channels["p_A"]) <= _STRETCH else None
+
+    def _compute_rows(self, channels: Mapping[str, Array]) -> Array:
+        """Compute the rows of samples, arrays by channel name."""
+        return pressure_level_rows(channels, self._rate, self._means, self._max_speed, self._mean_position)
 
 
 def pressure_level_rows(

@@ -330,18 +330,22 @@ def _invert_regular(matrices: Array) -> Array | None:
     return np.asarray(inverses) if (condition < MAX_CONDITION).all() else None
 
 
-def fit_difference(recording: Recording) -> Resistance | None:
+def fit_difference(recording: Recording, motion: Motion | None = None) -> Resistance | None:
     """Fit p_A - p_B in motion by friction, which reverses with the motion, and a viscous pressure drop (`Resistance`).
 
     The result is None if too few samples are in motion (`select_motion`), or if a value or its error is not finite.
+    `motion`: that of the recording, if it is known.
     """
-    return compute_once(recording, ("motion fit of p_A - p_B",), _fit_difference)
+    return compute_once(
+        recording,
+        ("motion fit of p_A - p_B",),
+        lambda samples: _fit_difference(samples, motion or select_motion(samples)),
+    )
 
 
 @np.errstate(all="ignore")
-def _fit_difference(recording: Recording) -> Resistance | None:
+def _fit_difference(recording: Recording, motion: Motion | None) -> Resistance | None:
     """Fit p_A - p_B in motion by friction and a viscous drop (`fit_difference`)."""
-    motion = select_motion(recording)
     if motion is None:
         return None
     difference = recording["p_A"][motion.rows] - recording["p_B"][motion.rows]

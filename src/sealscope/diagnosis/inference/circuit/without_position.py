@@ -230,7 +230,7 @@ def recorded_oil_loss_tests(recording: Recording, rig: Rig, offset: float) -> di
     `offset`: sensor offset of p_A - p_B [Pa]. Empty for a double rod: its strokes draw no oil from the accumulator, so
     the check valves may stay shut, and no chamber then has the pressure of the accumulator.
     """
-    if not rig.cylinder.single_rod:
+    if not rig.cylinder.single_rod or rig.makeup.check_valves == "absent":
         return {}
     signals = Signals(samples_without_holes(recording, ("x", "p_A", "p_B")), recording.rate, offset=offset)
     x_step = signals.step("x")  # missing steps count as 0 in the search for the cycle

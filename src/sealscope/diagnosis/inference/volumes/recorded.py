@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -20,7 +20,7 @@ from sealscope.diagnosis.estimate.change import (
 from sealscope.diagnosis.estimate.interval import WITHIN_95, Estimate, Interval
 from sealscope.diagnosis.estimate.linear import Gaussian
 from sealscope.diagnosis.estimate.population import weigh_alternatives
-from sealscope.diagnosis.inference.balance_samples import derive_drive_signals
+from sealscope.diagnosis.inference.balance_samples import READ, derive_drive_signals
 from sealscope.diagnosis.inference.blocks import (
     Blocks,
     ColumnRoles,
@@ -40,6 +40,7 @@ from sealscope.diagnosis.inference.circuit.holds.recorded_hold import (
     find_charge_pressure,
     find_locked_holds,
 )
+from sealscope.diagnosis.inference.circuit.without_position import recorded_oil_loss_tests
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums, block_weights
 from sealscope.diagnosis.inference.delays import DelayChange, DelayTest
 from sealscope.diagnosis.inference.equations.balances import find_rest_limits
@@ -102,7 +103,7 @@ class RecordedBalance:
 
     - `blocks`, `equations`, `columns`: blocks with the Gram matrices of the balances, of which there is one or, behind
       a servo valve, one for each chamber; and the roles of their columns.
-    - `oil_loss`: tests for external leaks by the volume of the accumulator, by the name of the term.
+    - `cycle_oil_loss`: `oil_loss` of a balance over cycles or holds; None with a position.
     - `plain`: the blocks without the correction of the pressure offset, None if there is no such correction.
     - `valves`: those between pump and cylinder at rest; if they hold the load, these times measure the leaks
       (`chambers`).
@@ -116,7 +117,7 @@ class RecordedBalance:
     columns: tuple[ColumnRoles, ...]
     rig: Rig
     recording: Recording
-    oil_loss: Mapping[str, StepTest] = field(default_factory=dict)
+    cycle_oil_loss: Mapping[str, StepTest] | None = None
     plain: Blocks | None = None
     valves: Valves = Valves.OPEN
     known_stroke: tuple[float, float] | None = None
@@ -128,6 +129,19 @@ class RecordedBalance:
     def flow(self) -> Flow:
         """Source of the flow in the balance."""
         return self.equations[0].flow
+
+    @property
+    def oil_loss(self) -> Mapping[str, StepTest]:
+        """Tests for external leaks by the volume of the accumulator, by the name of the term; cached."""
+        if self.cycle_oil_loss is not None:
+            return self.cycle_oil_loss
+        offset = float(self.blocks.zero[0])  # sensor offset that was removed from p_A - p_B [Pa]
+
+        def test_oil_loss(samples: Recording) -> dict[str, StepTest]:
+            """Test the samples, whose motion is known."""
+            return recorded_oil_loss_tests(samples, self.rig, offset)
+
+        return compute_once(self.recording, ("lost oil", self.rig, offset), test_oil_loss, READ)
 
     @property
     def has_position_and_flow(self) -> bool:

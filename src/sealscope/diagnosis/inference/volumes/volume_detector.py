@@ -14,7 +14,7 @@ from sealscope.diagnosis.healthy import Healthy, healthy_summaries
 from sealscope.diagnosis.inference.balance_samples import READ
 from sealscope.diagnosis.inference.block_stream import min_samples_for_step
 from sealscope.diagnosis.inference.blocks import ColumnRoles
-from sealscope.diagnosis.inference.circuit.without_position import cycle_balances, recorded_oil_loss_tests
+from sealscope.diagnosis.inference.circuit.without_position import cycle_balances
 from sealscope.diagnosis.inference.comparison.levels import leak_deviations_from_mean, rise
 from sealscope.diagnosis.inference.comparison.recording_sums import (
     BalanceSummary,
@@ -151,15 +151,8 @@ class VolumeBalance:
 
         `by_state`: as in `RecordedBalance`.
         """
-        offset = float(regime.blocks.zero[0])  # sensor offset that was removed from p_A - p_B [Pa]
-        oil_loss = compute_once(
-            recording,
-            ("lost oil", self.rig, offset),
-            lambda samples: recorded_oil_loss_tests(samples, self.rig, offset),
-            READ,
-        )
         return RecordedBalance(
-            regime.blocks, regime.equations, regime.columns, self.rig, recording, oil_loss,
+            regime.blocks, regime.equations, regime.columns, self.rig, recording,
             plain=regime.plain, valves=regime.valves, by_state=by_state,
             delay_changes=regime.delay_changes, delay_tests=regime.delay_tests,
         )  # fmt: skip

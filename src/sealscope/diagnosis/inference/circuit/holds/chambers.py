@@ -290,8 +290,12 @@ class HeldChambers:
         """
         difference = self.driving_pressure(leak.offset)
         flow = np.sign(difference) * np.abs(difference) ** leak.exponent
-        flow *= growth_factor(self._samples.t, leak.growth, leak.onset, self.end)
-        return self._while_closed(np.array([flow, -flow]), leak.supplies)
+        unit_leak = self._while_closed(np.array([flow, -flow]), leak.supplies)
+        return self._let_grow(unit_leak, leak.growth, leak.onset)
+
+    def _let_grow(self, leak: UnitLeak, growth: float, onset: float) -> UnitLeak:
+        """Multiply the flow of a leak without growth by its `growth_factor`, from the `onset` [s] to the end."""
+        return leak._replace(flows=leak.flows * growth_factor(self._samples.t, growth, onset, self.end))
 
     def _while_closed(self, flows: Array, supplies: SideSupplies) -> UnitLeak:
         """Set `flows` (2, N) out of A and B to 0 while a side is not closed."""
@@ -516,27 +520,29 @@ class HeldChambers:
         ]
 
     @cached_property
-    def _laws(self) -> list[tuple[PistonLeak, float, Array]]:
-        """Leaks past the piston, one for each law; with each its log prior and its log posteriors (o,) over `onsets`.
+    def _laws(self) -> list[tuple[LawFit, Array]]:
+        """Fits of a leak past the piston, one for each law, and with each the log posteriors (o,) over `onsets`.
 
         A law states the exponent of the pressure (`LAWS`) and the growth of the leak (`GROWTHS`). The leak begins at
         the most probable onset under its law; sensor offset and supplies are those of `piston_fits`.
         """
         laws = []
         for leak, law_prior in zip(self.piston_fits, LAWS.values(), strict=True):
-            unit_leak = self._unit_piston_leak(leak)
+            unit_leak, conditions_log_prior = self._unit_piston_leak(leak), self._conditions_log_prior(leak)
             for growth, growth_prior in GROWTHS.items():
                 log_prior = math.log(law_prior * growth_prior)
                 posteriors = log_prior + self._onset_posteriors(unit_leak, growth)
                 onset = float(self.onsets[posteriors.argmax()])
-                laws.append((leak._replace(growth=growth, onset=onset), log_prior, posteriors))
+                fit = self._fit_leak(self._let_grow(unit_leak, growth, onset), onset)
+                fit = fit._replace(log_likelihood=fit.log_likelihood + conditions_log_prior)
+                law = leak._replace(growth=growth, onset=onset)
+                laws.append((LawFit(law, fit, fit.log_likelihood + log_prior), posteriors))
         return laws
 
-    @cached_property
+    @property
     def law_fits(self) -> list[LawFit]:
         """Fits of a leak past the piston for each law (exponent and growth); the first is laminar without growth."""
-        fits = [(leak, self.fit_piston_leak(leak), log_prior) for leak, log_prior, _ in self._laws]
-        return [LawFit(leak, fit, fit.log_likelihood + log_prior) for leak, fit, log_prior in fits]
+        return [fit for fit, _ in self._laws]
 
     def _fit_growing_leak(self, leaks: Sequence[UnitLeak]) -> tuple[LeakFit, int]:
         """Fit a leak that is not past the piston and may grow, and return the fit with the index of its onset.
@@ -550,8 +556,7 @@ class HeldChambers:
         for leak, (growth, probability) in itertools.product(leaks, GROWTHS.items()):
             index = int(self._onset_posteriors(leak, growth).argmax())
             onset = float(self.onsets[index])
-            flows = leak.flows * growth_factor(self._samples.t, growth, onset, self.end)
-            fit = self._fit_leak(leak._replace(flows=flows), onset)
+            fit = self._fit_leak(self._let_grow(leak, growth, onset), onset)
             mean_ratio = 1.0 + 0.5 * growth  # mean over initial coefficient, for a linear growth
             fits.append((fit.scale(mean_ratio, fit.log_likelihood), index))  # scaling does not change the likelihood
             # such a leak moves no oil to the other side, which therefore does not drain
@@ -658,7 +663,7 @@ class HeldChambers:
         The interval is widened on either side to the next of the evenly spaced onsets within holds, or to the whole
         time between two holds.
         """
-        posteriors = np.logaddexp.reduce([posteriors for _, _, posteriors in self._laws])
+        posteriors = np.logaddexp.reduce([posteriors for _, posteriors in self._laws])
         up_to = np.cumsum(weigh_alternatives(posteriors))  # probability of an onset up to each
         first, best, last = np.searchsorted(up_to, [0.5 * TAIL, 0.5, 1.0 - 0.5 * TAIL])
         if first < 2:  # the onset may be the beginning of the recording or the first one within a hold

@@ -216,7 +216,7 @@ def fit_leak(regression: OilRegression, sums: Array, n_readings: float) -> LeakR
     )  # fmt: skip
     if not sums.size:
         return LeakRegression(0.0, 0.0, 0.0, variance)
-    covariance = variance * regression.inflation * work.inverse
-    # part of the variance that would vanish if the properties of the oil were known
-    by_oil = float(covariance[0, 1:] @ np.linalg.solve(covariance[1:, 1:], covariance[1:, 0]))
-    return LeakRegression(float(work.solution[0]), float(covariance[0, 0]) - by_oil, by_oil, variance)
+    total = variance * regression.inflation * float(work.inverse[0, 0])
+    # if the properties of the oil were known, only the leak's own element of the normal matrix would count
+    by_noise = variance * regression.inflation / (float(work.gram[0, 0]) * (1.0 + RIDGE))
+    return LeakRegression(float(work.solution[0]), by_noise, total - by_noise, variance)
