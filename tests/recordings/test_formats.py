@@ -17,7 +17,7 @@ from ..fuzz.recordings import KINDS
 ROOT = Path(__file__).resolve().parents[2]
 FORMATS = files._FORMATS
 FOLDER = Path(files.__file__).parent / "formats"
-KEYS = {"words", "module", "suffixes", "begins", "recognise", "text", "safe", "slow", "written"}
+KEYS = {"words", "module", "suffixes", "begins", "recognise", "possible", "text", "safe", "slow", "written"}
 
 
 @pytest.mark.parametrize("kind", FORMATS)
@@ -28,6 +28,13 @@ def test_a_row_names_functions_of_its_module(kind: str) -> None:
     wanted = [f"read_{kind}"] + [f"write_{kind}"] * row.get("written", False)
     wanted += [row["recognise"]] if "recognise" in row else []
     assert all(callable(getattr(module, name, None)) for name in wanted), wanted
+    assert ("recognise" in row) == ("possible" in row)
+
+
+def test_a_table_of_commas_is_asked_for_no_other_format(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(files, "_format_function", lambda kind, name: pytest.fail(f"{kind} is loaded"))
+    head = b"t [s],p_A [Pa],p_B [Pa]\n0.0,1.0,2.0\n"
+    assert files._find_format(head, is_text=False) is files._find_format(head, is_text=True) is None
 
 
 def test_no_file_is_both_read_and_refused() -> None:

@@ -28,8 +28,10 @@ from sealscope.storage.opening import max_unpacked_size, open_regular, raising_u
 #: `formats.toml`: formats that are read, and formats that are recognised by first bytes or suffix but not read.
 _TABLES: dict[str, dict[str, Any]] = tomllib.loads(Path(__file__).with_name("formats.toml").read_text("utf-8"))
 _FORMATS, _PROPRIETARY = _TABLES["read"], _TABLES["proprietary"]
-#: Format, or kind of archive, -> pattern of the first bytes; and pattern -> words for a format that is not read.
+#: Format, or kind of archive, -> pattern of the first bytes, or of those that its `recognise` function may accept; and
+#: pattern -> words for a format that is not read.
 _BEGINS = {kind: re.compile(entry["begins"].encode()) for kind, entry in _FORMATS.items() if "begins" in entry}
+_POSSIBLE = {kind: re.compile(entry["possible"].encode()) for kind, entry in _FORMATS.items() if "possible" in entry}
 _ARCHIVES = {kind: re.compile(begins.encode()) for kind, begins in _TABLES["archives"].items()}
 _FOREIGN = {re.compile(begins.encode()): words for begins, words in _TABLES["foreign"].items()}
 #: Suffix -> format, of all files that are read.
@@ -80,14 +82,9 @@ def _detect_format(path: Path) -> str:
 
 def _find_format(head: bytes, *, is_text: bool) -> str | None:
     """Find the text or binary format whose `recognise` function accepts a file's first bytes; None if none does."""
-    for kind, entry in _FORMATS.items():
-        if (
-            "recognise" in entry
-            and bool(entry.get("text")) == is_text
-            and _format_function(kind, entry["recognise"])(head)
-        ):
-            return kind
-    return None
+    kinds = (kind for kind, begins in _POSSIBLE.items() if begins.match(head))
+    asked = (kind for kind in kinds if bool(_FORMATS[kind].get("text")) == is_text)
+    return next((kind for kind in asked if _format_function(kind, _FORMATS[kind]["recognise"])(head)), None)
 
 
 def _format_function(kind: str, name: str) -> Callable[..., Any]:
