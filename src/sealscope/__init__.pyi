@@ -18,7 +18,7 @@ from sealscope.fmu.build import write_sensor_fmu as write_sensor_fmu
 from sealscope.fmu.recording import record_fmu as record_fmu
 from sealscope.parameters import Rig as Rig
 from sealscope.parameters import load_rig as load_rig
-from sealscope.parameters.load import rigs as rigs
+from sealscope.parameters.rig import rigs as rigs
 from sealscope.recordings import Recording as Recording
 from sealscope.recordings import inspect as inspect
 from sealscope.recordings import read as read

@@ -10,7 +10,7 @@ import pytest
 
 import sealscope
 from sealscope.parameters import load_rig
-from sealscope.parameters.load import save_channel_map
+from sealscope.parameters.rig import save_channel_map
 
 from ..refusals import refusal
 

@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from sealscope import diagnose
-from sealscope.diagnosis.assumed_rig import infer_rig
-from sealscope.diagnosis.inference.circuit.recognition import recognise_circuit
+from sealscope.diagnosis.assumed_rig import infer_rig, recognise_circuit
 from sealscope.diagnosis.verdict.machine_sizes import unstated_rig
 from sealscope.parameters import Rig
 from sealscope.recordings.recording import Recording

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.rms_change.rms_detector import column_names, cut_blocks, measure_levels
-from sealscope.recordings.cycle import find_cycle
+from sealscope.recordings.motion import find_cycle
 from sealscope.recordings.recording import Recording
 from sealscope.signals.details import details
 from sealscope.simulation.commands import parse_command

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.decision.case import Case, OtherEvent
-from sealscope.diagnosis.decision.null import HealthyNull
+from sealscope.diagnosis.decision.case import Case, HealthyNull, OtherEvent
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.inference.changes.features import observe_signals
 from sealscope.diagnosis.inference.changes.level_changes import estimate_levels, level_tests

@@ -13,8 +13,8 @@ from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.inference.pressures.response import Follower
 from sealscope.diagnosis.inference.pressures.response_detector import PressureResponse
 from sealscope.parameters import Rig, load_rig
-from sealscope.recordings import cycle
-from sealscope.recordings.cycle import estimate_period
+from sealscope.recordings import motion
+from sealscope.recordings.motion import estimate_period
 from sealscope.recordings.recording import Array, Recording, compute_once
 from sealscope.simulation.simulate import simulate
 
@@ -84,7 +84,7 @@ def test_the_cycle_is_computed_once_a_diagnosis(monkeypatch: pytest.MonkeyPatch,
         lengths.append(estimate_period(signal, rate))
         return lengths[-1]
 
-    monkeypatch.setattr(cycle, "estimate_period", counted)
+    monkeypatch.setattr(motion, "estimate_period", counted)
     diagnose(recording)
     assert lengths == [pytest.approx(np.pi / 2, rel=2e-3)]
 

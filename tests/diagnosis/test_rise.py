@@ -11,7 +11,7 @@ from scipy.stats import binom, kstest, norm
 
 from sealscope.diagnosis.estimate.population import Mixture, Population, ScatterPrior
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, scale_grams
-from sealscope.diagnosis.inference.comparison.levels import rise
+from sealscope.diagnosis.inference.comparison.levels import Rise, rise, rise_of_mixture
 from sealscope.diagnosis.inference.comparison.recording_sums import (
     RecordingSums,
     Resistance,
@@ -21,7 +21,6 @@ from sealscope.diagnosis.inference.comparison.recording_sums import (
     find_unusual_conditions,
     motion_change,
 )
-from sealscope.diagnosis.inference.comparison.rise import Rise, rise_of_mixture
 from sealscope.diagnosis.inference.equations.terms import LAG, LEAK, Equation, Term
 from sealscope.diagnosis.inference.volumes.volume_detector import compare_motion
 from sealscope.diagnosis.priors.inference import INFERENCE

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
+from sealscope.diagnosis.decision.case import HealthyNull
 from sealscope.diagnosis.decision.decide import decide
-from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
 from sealscope.diagnosis.rms_change.rms_detector import (

@@ -12,8 +12,7 @@ import pytest
 from sealscope.diagnosis.decision.explanations import load_events
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause
-from sealscope.diagnosis.verdict.severity import RepairLimit
-from sealscope.diagnosis.verdict.states import joint_causes, state_of
+from sealscope.diagnosis.verdict.severity import RepairLimit, joint_causes, state_of
 
 from ..refusals import refusal
 from .balance_machine import machine, step

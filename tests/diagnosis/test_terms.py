@@ -12,10 +12,9 @@ import pytest
 from sealscope.control.drive import Drive
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.estimate.change import StepTest, step_test
-from sealscope.diagnosis.inference.balance_samples import derive_drive_signals
 from sealscope.diagnosis.inference.block_stream import BlockStream
 from sealscope.diagnosis.inference.blocks import estimate_offset, information
-from sealscope.diagnosis.inference.equations.balances import equations
+from sealscope.diagnosis.inference.equations.balances import derive_drive_signals, equations
 from sealscope.diagnosis.inference.regimes import recorded_blocks
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.parameters import Rig, load_rig

@@ -16,7 +16,7 @@ from scipy.stats import halfnorm, multivariate_normal
 import sealscope as ss
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.priors.trend import TREND
-from sealscope.diagnosis.trend import trend_leak
+from sealscope.diagnosis.trend import machine_trend
 from sealscope.diagnosis.trend.machine_trend import Trend
 from sealscope.diagnosis.trend.machine_trend import trend as trend_of
 from sealscope.diagnosis.trend.reading import LeakReading, estimate_reading
@@ -253,7 +253,7 @@ def test_a_rise_that_another_event_explains_is_no_leak(monkeypatch: pytest.Monke
     alone = trend_of(days, healthy=8)
     assert alone.verdict == "leak" and alone.decision.cause == "piston or pump leak"
     lost = Observable(name="external leak A", data="rise", score=200.0, chance=1e-40)
-    monkeypatch.setattr(trend_leak, "_rival_changes", lambda last, before, since: (lost,))
+    monkeypatch.setattr(machine_trend, "_rival_changes", lambda last, before, since: (lost,))
     trend = trend_of(days, healthy=8)
     assert trend.alarm is not None and trend.verdict != "leak"
     assert trend.decision.cause == "external leak" and trend.state.cause == "external leak"
@@ -264,9 +264,9 @@ def test_a_rise_that_another_event_explains_is_no_leak(monkeypatch: pytest.Monke
 def test_rates_by_unlike_clocks_are_compared(monkeypatch: pytest.MonkeyPatch, error: float, compared: int) -> None:
     """Rates that are estimated from times differ in their last digits."""
     used: list[int] = []
-    compare = trend_leak.compare_summaries
+    compare = machine_trend.compare_summaries
     monkeypatch.setattr(
-        trend_leak,
+        machine_trend,
         "compare_summaries",
         lambda judged, healthy, chambers: used.append(len(healthy)) or compare(judged, healthy, chambers),
     )
@@ -295,8 +295,8 @@ def test_a_machine_whose_recordings_are_all_healthy_has_a_bound(days: int) -> No
 def test_a_worn_pump_and_a_seal_are_one_cause_and_the_balance_names_its_rivals(simulated: Trend) -> None:
     points = [simulated.points[row] for row in simulated.rows]
     assert simulated.wear is not None and simulated.decision.cause == "piston, pump or external leak"
-    before, since = trend_leak._split_at_onset(points, simulated.wear)
-    names = {observable.name for observable in trend_leak._rival_changes(points[-1], before, since)}
+    before, since = machine_trend._split_at_onset(points, simulated.wear)
+    names = {observable.name for observable in machine_trend._rival_changes(points[-1], before, since)}
     assert {"external leak A", "external leak B", "free air"} <= names
 
 

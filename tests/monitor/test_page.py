@@ -15,7 +15,7 @@ import pytest
 from prometheus_client.parser import text_string_to_metric_families
 from starlette.testclient import TestClient
 
-from sealscope.diagnosis.verdict.states import state_of
+from sealscope.diagnosis.verdict.severity import state_of
 from sealscope.errors import InputError
 from sealscope.monitor.alarms import rank_actuators
 from sealscope.monitor.page.live import LiveSamples

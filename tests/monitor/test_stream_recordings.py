@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import sealscope as ss
-from sealscope.diagnosis.verdict.states import state_of
+from sealscope.diagnosis.verdict.severity import state_of
 from sealscope.monitor.alarms import AlarmJudge
 from sealscope.monitor.outputs.prometheus import format_metrics
 from sealscope.monitor.service import Service

@@ -18,7 +18,7 @@ import sealscope as ss
 from sealscope.diagnosis.commissioned.watched import is_remeasured, load_watched
 from sealscope.diagnosis.live.watch import Watch, watch
 from sealscope.diagnosis.verdict.machine_sizes import unstated_rig
-from sealscope.diagnosis.verdict.states import state_of
+from sealscope.diagnosis.verdict.severity import state_of
 from sealscope.errors import InputError
 from sealscope.monitor.alarms import AlarmJudge
 from sealscope.monitor.outputs.prometheus import format_metrics

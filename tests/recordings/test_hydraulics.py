@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sealscope.recordings import CHANNEL_UNITS, Recording, read
-from sealscope.recordings.hydraulics import find_implausibility
+from sealscope.recordings.quality import find_implausibility
 
 REAL = Path(__file__).resolve().parents[3] / "shared" / "data" / "real"
 RATE, N = 500.0, 60_000

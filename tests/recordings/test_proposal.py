@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 
 from sealscope.errors import UnreadableFile
 from sealscope.recordings import read
-from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.formats.headings.proposal import proposed_map, split_unit
-from sealscope.recordings.hydraulics import describe_missing_chambers
+from sealscope.recordings.formats.headings.labels import Label, proposed_map, split_unit
+from sealscope.recordings.quality import describe_missing_chambers
 
 from ..refusals import refusal
 

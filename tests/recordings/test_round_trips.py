@@ -15,7 +15,7 @@ from hypothesis.extra import numpy as hnp
 
 from sealscope.errors import InputError, MissingExtra
 from sealscope.recordings import CHANNEL_UNITS, COUNTS, Recording, read, write
-from sealscope.recordings.cycle import find_cycle
+from sealscope.recordings.motion import find_cycle
 from sealscope.recordings.subprocesses import CrashedSubprocessError, run_in_subprocess
 
 from ..refusals import refusal

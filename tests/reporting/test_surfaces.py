@@ -12,7 +12,7 @@ import pytest
 
 from sealscope.diagnosis.verdict.evidence import AGAINST, WITHIN, Evidence, LeakCourse, RelativeLeak, TotalLeakage
 from sealscope.diagnosis.verdict.machine_sizes import AssumedMachine
-from sealscope.diagnosis.verdict.states import state_of
+from sealscope.diagnosis.verdict.severity import state_of
 from sealscope.monitor.alarms import Alarm
 from sealscope.monitor.outputs.prometheus import format_metrics
 from sealscope.reporting import messages

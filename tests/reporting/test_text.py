@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sealscope.diagnosis.verdict.evidence import Evidence
-from sealscope.diagnosis.verdict.states import state_of
+from sealscope.diagnosis.verdict.severity import state_of
 from sealscope.recordings.quality import Finding
 from sealscope.reporting import messages
 from sealscope.reporting.messages import diagnosis_text

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from sealscope.errors import InputError
-from sealscope.signals.details import details, min_samples
-from sealscope.signals.filters import decomposition_filters, reach
+from sealscope.signals.details import decomposition_filters, details, min_samples, reach
 from sealscope.signals.windows import rms
 
 from ..refusals import refusal

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sealscope.signals.filters import MAX_LEVELS, decomposition_filters, reach, require_finite, require_levels
+from sealscope.signals.details import MAX_LEVELS, decomposition_filters, reach, require_finite, require_levels
 
 from ..refusals import refusal
 

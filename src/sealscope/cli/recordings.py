@@ -331,7 +331,7 @@ def inspect(
     save_map: Annotated[bool, Option("--save-map", help=_SAVE_MAP)] = False,
 ) -> None:
     """Show the content of a file and its defects; columns without a map are recognised by their names."""
-    from sealscope.parameters.load import save_channel_map
+    from sealscope.parameters.rig import save_channel_map
     from sealscope.recordings import inspect as find_defects
     from sealscope.recordings.corrections.unsigned import restore_signs
     from sealscope.reporting.overview import overview_text

@@ -16,8 +16,8 @@ import numpy as np
 
 from sealscope.calls import checked_call
 from sealscope.diagnosis.assumed_rig import assumed_rig
+from sealscope.diagnosis.decision.case import HealthyNull
 from sealscope.diagnosis.decision.decide import ORDER, combine, decide, is_decided, rank
-from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.decision.reasons import text_of
 from sealscope.diagnosis.detectors.observation import healthy_null, limit_threads, observe_rivals, run_detector
 from sealscope.diagnosis.detectors.registry import detectors

@@ -18,14 +18,14 @@ from sealscope.diagnosis.assumed_rig import assumed_rig
 from sealscope.diagnosis.detectors.observation import limit_threads
 from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.estimate.linear import Gaussian
-from sealscope.diagnosis.inference.balance_samples import (
+from sealscope.diagnosis.inference.equations.balances import (
     CLIPPED_DIFFERENCE,
     HOLE,
     absolute_offset,
     bridged_samples,
     derive_drive_signals,
+    find_rest_limits,
 )
-from sealscope.diagnosis.inference.equations.balances import find_rest_limits
 from sealscope.diagnosis.inference.equations.signals import Signals
 from sealscope.diagnosis.inference.equations.terms import START, Flow
 from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance

@@ -18,12 +18,18 @@ from sealscope.diagnosis.healthy import Healthy, SummarisedRecording, learn_once
 from sealscope.paragraphs import join_names
 from sealscope.recordings.channels import CHANNEL_UNITS, SLOW, chambers_of
 from sealscope.recordings.corrections.samples import correct_samples
-from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.formats.headings.proposal import find_name_and_unit, suggest_map_entry
-from sealscope.recordings.hydraulics import describe_missing_chambers, find_implausibility
+from sealscope.recordings.formats.headings.labels import Label, find_name_and_unit, suggest_map_entry
 from sealscope.recordings.oil import oil_temperature
 from sealscope.recordings.priors import RECORDINGS
-from sealscope.recordings.quality import MISSING_CHANNEL, SHORTEST, Finding, Severity, inspect
+from sealscope.recordings.quality import (
+    MISSING_CHANNEL,
+    SHORTEST,
+    Finding,
+    Severity,
+    describe_missing_chambers,
+    find_implausibility,
+    inspect,
+)
 from sealscope.recordings.recording import Recording, compute_once
 from sealscope.units import same_dimension
 

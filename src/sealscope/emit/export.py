@@ -13,9 +13,8 @@ import numpy as np
 from sealscope.calls import checked_call
 from sealscope.diagnosis.commissioned.machine import CommissionedMachine
 from sealscope.diagnosis.healthy import Healthy
-from sealscope.diagnosis.inference.balance_samples import absolute_offset
 from sealscope.diagnosis.inference.comparison.recording_sums import BalanceSummary
-from sealscope.diagnosis.inference.equations.balances import PUMP_VOLUMES
+from sealscope.diagnosis.inference.equations.balances import PUMP_VOLUMES, absolute_offset
 from sealscope.diagnosis.inference.rows.row_weights import SUPPORT
 from sealscope.diagnosis.live.joining import SampleRun
 from sealscope.diagnosis.live.kernel.stream import RESULTS, StreamSettings

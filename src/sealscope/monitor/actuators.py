@@ -27,7 +27,7 @@ from sqlalchemy.exc import IntegrityError
 from sealscope.diagnosis.commissioned.watched import WatchedMachine, is_remeasured, load_watched
 from sealscope.diagnosis.live.estimates import BlockEstimate
 from sealscope.diagnosis.live.watch import STATE_VERSION, Watch, watch
-from sealscope.diagnosis.verdict.states import LEAKING, MachineState, state_of
+from sealscope.diagnosis.verdict.severity import LEAKING, MachineState, state_of
 from sealscope.errors import InputError, SealscopeError
 from sealscope.monitor.alarms import Alarm, AlarmJudge
 from sealscope.monitor.database import tables

@@ -23,7 +23,7 @@ from typing import Any, Literal
 from sealscope.diagnosis.commissioned.machine import JUDGEMENTS
 from sealscope.diagnosis.live.estimates import BlockEstimate, Interval, WatchedLeak
 from sealscope.diagnosis.verdict.evidence import LEAK
-from sealscope.diagnosis.verdict.states import LEAK_OVER_LIMIT, state_of
+from sealscope.diagnosis.verdict.severity import LEAK_OVER_LIMIT, state_of
 from sealscope.errors import InputError
 from sealscope.monitor.settings import WatchSettings
 from sealscope.monitor.verdicts import STREAM_SHARE, RecordingVerdict

@@ -18,8 +18,7 @@ from sealscope.diagnosis.live.joining import CHANNELS, format_ways
 from sealscope.diagnosis.priors.live import LIVE
 from sealscope.errors import InputError
 from sealscope.recordings.channels import CHANNEL_UNITS
-from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.formats.headings.proposal import split_unit
+from sealscope.recordings.formats.headings.labels import Label, split_unit
 from sealscope.storage.toml_file import read_model, read_toml
 from sealscope.units import same_dimension, to_si
 

@@ -25,7 +25,7 @@ from sealscope.diagnosis.priors.live import LIVE
 from sealscope.diagnosis.trend.machine_trend import Trend, trend
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, LEAK, NO_LEAK
-from sealscope.diagnosis.verdict.states import state_of
+from sealscope.diagnosis.verdict.severity import state_of
 from sealscope.recordings.formats.times.timebase import clock_text
 from sealscope.recordings.recording import Recording
 from sealscope.reporting.messages import how_much

@@ -8,16 +8,15 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sealscope.parameters.instruments import Daq as Daq
     from sealscope.parameters.instruments import PressureTransducer as PressureTransducer
-    from sealscope.parameters.load import load_rig as load_rig
-    from sealscope.parameters.load import rig_names as rig_names
     from sealscope.parameters.rig import Rig as Rig
     from sealscope.parameters.rig import declared_names as declared_names
+    from sealscope.parameters.rig import load_rig as load_rig
     from sealscope.parameters.rig import parse_overrides as parse_overrides
+    from sealscope.parameters.rig import rig_names as rig_names
 
 _NAMES = {
     "instruments": ("Daq", "PressureTransducer"),
-    "load": ("load_rig", "rig_names"),
-    "rig": ("Rig", "declared_names", "parse_overrides"),
+    "rig": ("Rig", "declared_names", "load_rig", "parse_overrides", "rig_names"),
 }
 
 

@@ -7,8 +7,7 @@ from pathlib import Path
 from string import Template
 
 from sealscope.errors import InputError
-from sealscope.parameters.load import load_rig
-from sealscope.parameters.rig import GAS_OVER_ROD, Rig
+from sealscope.parameters.rig import GAS_OVER_ROD, Rig, load_rig
 from sealscope.units import BAR, LITRE_PER_MINUTE
 
 _DEAD_VOLUME_RATIO = 0.25  # dead volume of each side, divided by the larger swept volume

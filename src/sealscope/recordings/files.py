@@ -83,8 +83,8 @@ def _detect_format(path: Path) -> str:
 def _find_format(head: bytes, *, is_text: bool) -> str | None:
     """Find the text or binary format whose `recognise` function accepts a file's first bytes; None if none does."""
     kinds = (kind for kind, begins in _POSSIBLE.items() if begins.match(head))
-    asked = (kind for kind in kinds if bool(_FORMATS[kind].get("text")) == is_text)
-    return next((kind for kind in asked if _format_function(kind, _FORMATS[kind]["recognise"])(head)), None)
+    candidates = (kind for kind in kinds if bool(_FORMATS[kind].get("text")) == is_text)
+    return next((kind for kind in candidates if _format_function(kind, _FORMATS[kind]["recognise"])(head)), None)
 
 
 def _format_function(kind: str, name: str) -> Callable[..., Any]:

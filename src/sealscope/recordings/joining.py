@@ -12,8 +12,7 @@ import numpy as np
 
 from sealscope.calls import checked_call
 from sealscope.errors import InputError
-from sealscope.recordings.formats.times.dates import parse_name
-from sealscope.recordings.formats.times.timebase import counts_from_1970, parse_epoch
+from sealscope.recordings.formats.times.timebase import counts_from_1970, parse_epoch, parse_name
 from sealscope.recordings.recording import Recording
 
 _DAY = 86400.0  # [s]

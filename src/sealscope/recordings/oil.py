@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import re
 
-from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.formats.headings.proposal import find_name_and_unit, is_oil_temperature, names_oil
+from sealscope.recordings.formats.headings.labels import Label, find_name_and_unit, is_oil_temperature, names_oil
 from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.recording import Recording
 

@@ -14,11 +14,10 @@ from sealscope.diagnosis.decision.decide import ORDER
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LEAKS, RMS_CHANGE, TotalLeakage
 from sealscope.diagnosis.verdict.machine_sizes import AssumedMachine
-from sealscope.diagnosis.verdict.states import MachineState
+from sealscope.diagnosis.verdict.severity import MachineState
 from sealscope.errors import printable
 from sealscope.paragraphs import format_count, join_names, paragraph, paragraphs
-from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.formats.headings.proposal import suggest_map_entry
+from sealscope.recordings.formats.headings.labels import Label, suggest_map_entry
 from sealscope.recordings.quality import MISSING_CHANNEL
 from sealscope.units import from_si
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from sealscope.compiled import kernel
-from sealscope.signals.filters import Array
+from sealscope.signals.details import Array
 
 
 def filter_recursively(values: Array, decay: float, b_0: float, b_1: float = 0.0, carried: float = 0.0) -> Array:

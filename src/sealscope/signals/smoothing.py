@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from sealscope.signals.filters import Array
+from sealscope.signals.details import Array
 
 #: Smallest divisor, which avoids a division by 0.
 TINY = 1e-300

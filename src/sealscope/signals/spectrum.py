@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sealscope.signals.filters import Array
+from sealscope.signals.details import Array
 
 
 def average_power(values: Array, segment: int, n_fft: int) -> Array:

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sealscope.errors import InputError
-from sealscope.signals.details import Details
-from sealscope.signals.filters import Array, IntArray, require_finite, require_whole
+from sealscope.signals.details import Array, Details, IntArray, require_finite, require_whole
 
 WINDOW_SIZE = 1000
 WINDOW_STEP = 500

@@ -494,7 +494,7 @@ class StepErrorCheck:
         """
         import pywt
 
-        from sealscope.signals.filters import reach
+        from sealscope.signals.details import reach
 
         before, after = reach("db8", LEVELS)[-1]  # [-1]: the highest level reaches furthest
         # both runs' p_A, then both runs' p_B

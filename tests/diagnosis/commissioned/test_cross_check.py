@@ -6,7 +6,7 @@ from typing import Any, cast
 
 import pytest
 
-from sealscope.diagnosis.commissioned.cross_check import BY_OTHERS, cross_check
+from sealscope.diagnosis.commissioned.summary import BY_OTHERS, cross_check
 from sealscope.diagnosis.healthy import SummarisedRecording
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 

@@ -10,11 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.decision.case import AGAINST, LEVEL, WITHIN, Case
+from sealscope.diagnosis.decision.case import AGAINST, LEVEL, WITHIN, Case, HealthyNull
 from sealscope.diagnosis.decision.decide import decide
-from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.estimate.interval import Interval
-from sealscope.diagnosis.inference.comparison.rise import Rise
+from sealscope.diagnosis.inference.comparison.levels import Rise
 from sealscope.diagnosis.inference.observable import LeakMeasure, Observable, Observed
 from sealscope.diagnosis.verdict.evidence import Evidence
 

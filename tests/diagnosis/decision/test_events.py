@@ -30,7 +30,7 @@ from sealscope.diagnosis.inference.volumes.rivals import TURNING_DATA
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.diagnosis.rms_change.rms_detector import JUDGED
 from sealscope.parameters import load_rig
-from sealscope.parameters.load import rig_names
+from sealscope.parameters.rig import rig_names
 from sealscope.signals.details import QUANTITIES
 
 SOURCE = Path(ss.__file__).parent

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from sealscope.diagnosis.decision.case import Case
+from sealscope.diagnosis.decision.case import Case, HealthyNull
 from sealscope.diagnosis.decision.explanations import (
     LEAK_EVENTS,
     explain,
@@ -18,12 +18,11 @@ from sealscope.diagnosis.decision.explanations import (
     probability_against_chance,
     probability_of,
 )
-from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.estimate.interval import Estimate
-from sealscope.diagnosis.inference.comparison.rise import Rise
+from sealscope.diagnosis.inference.comparison.levels import Rise
 from sealscope.diagnosis.inference.observable import LeakRise, Observable, Observed
 from sealscope.diagnosis.priors.decision import DECISION
-from sealscope.diagnosis.verdict.states import state_of
+from sealscope.diagnosis.verdict.severity import state_of
 
 from .cases import observable
 

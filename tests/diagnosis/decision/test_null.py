@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.decision.null import HealthyNull, null_key
+from sealscope.diagnosis.decision.case import HealthyNull, null_key
 from sealscope.diagnosis.inference.observable import Observable
 
 from .cases import observable

@@ -11,7 +11,7 @@ from typing import Any
 from sealscope.campaigns.cases.case import CampaignCase, CaseInputs
 from sealscope.campaigns.plans.duty import COMMAND
 from sealscope.diagnosis.verdict.evidence import LEAKS, Evidence, Verdict
-from sealscope.diagnosis.verdict.states import joint_causes
+from sealscope.diagnosis.verdict.severity import joint_causes
 from sealscope.errors import InputError, SealscopeError
 from sealscope.evaluation.table import CANNOT_TELL
 from sealscope.simulation.faults import parse_fault

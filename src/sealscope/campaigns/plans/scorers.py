@@ -16,8 +16,7 @@ import numpy as np
 
 from sealscope.recordings.channels import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
-from sealscope.signals.details import QUANTITIES, details, mean_squares
-from sealscope.signals.filters import IntArray, reach
+from sealscope.signals.details import QUANTITIES, IntArray, details, mean_squares, reach
 
 #: The machine's start is left out of the first part: this many seconds, but at most this fraction of the part.
 START_SECONDS, START_FRACTION = 2.0, 0.05

@@ -17,7 +17,7 @@ import numpy as np
 
 from sealscope.calls import checked_call
 from sealscope.diagnosis.assumed_rig import assumed_rig, infer_rig
-from sealscope.diagnosis.commissioned.cross_check import cross_check
+from sealscope.diagnosis.commissioned.summary import cross_check
 from sealscope.diagnosis.detectors.observation import limit_threads, stored_surprisals
 from sealscope.diagnosis.detectors.registry import detectors, log_failure, unusable_reason
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY, diagnose

@@ -41,7 +41,7 @@ from sealscope.diagnosis.commissioned.machine import CommissionedMachine, Judged
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
 from sealscope.parameters import Rig
-from sealscope.parameters.load import MACHINE_TABLES
+from sealscope.parameters.rig import MACHINE_TABLES
 from sealscope.recordings.formats.columns import REST, check_request
 from sealscope.storage.atomic import atomic_write, check_folder
 from sealscope.storage.folders import lock_file

@@ -1,12 +1,26 @@
-"""Grounds of a decision: the report of the judging detector, other explanations, and the tests for a leak.
+"""Grounds of a decision: the report of the judging detector, other explanations, the tests for a leak, and their null.
 
 An observable is the result of a detector's test of one quantity for a change (`inference.observable`).
+
+The chances that detectors state are calibrated by those that they stated for healthy recordings, the null of the tests.
+A detector states for each statistic a chance (p-value) P, the probability that a healthy recording scores as high. If
+that is right, the surprisal u = -log P of a healthy recording is exponentially distributed. In a fraction of machines
+(`priors.toml`) the stated chances are too small: there u / lambda is exponential, with an exponential prior on log
+lambda > 0. With the u_1 .. u_n of n healthy recordings, and prior probabilities p_k of values lambda_k, the calibrated
+(predictive) chance is
+
+    P(u) = sum_k w_k exp(-u / lambda_k),    w_k ~ p_k lambda_k^(-n) exp(-sum_i u_i / lambda_k),
+
+where lambda_0 = 1 leaves the stated chance as it is.
+
+Thus a rest, a ramp or a warm-up that every healthy recording has raises no alarm. Without healthy recordings the
+stated chances are not changed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import NamedTuple
 
@@ -22,13 +36,83 @@ from sealscope.diagnosis.decision.explanations import (
     probability_against_chance,
     probability_of,
 )
-from sealscope.diagnosis.decision.null import HealthyNull, null_key
 from sealscope.diagnosis.estimate.interval import Estimate
-from sealscope.diagnosis.inference.comparison.rise import RISE
+from sealscope.diagnosis.estimate.population import weigh_alternatives
+from sealscope.diagnosis.inference.comparison.levels import RISE
 from sealscope.diagnosis.inference.observable import LeakMeasure, Observable, Observed
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.evidence import AGAINST, WITHIN
-from sealscope.diagnosis.verdict.states import joint_causes
+from sealscope.diagnosis.verdict.severity import joint_causes
+from sealscope.evaluation.scalar_search import find_root
+from sealscope.recordings.recording import Array
+
+#: Number of values of lambda that the calibrated chance sums over, in addition to 1.
+NODES = 64
+
+
+@dataclass(frozen=True, eq=False)
+class HealthyNull:
+    """Distribution of p-values in healthy recordings of a machine, by which the p-values of detectors are calibrated.
+
+    `surprisals`: -log(chance) of each test in each healthy recording, by the test's key (`null_key`, `case.step_key`).
+    """
+
+    surprisals: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    _posteriors: dict[str, tuple[Array, Array]] = field(default_factory=dict, init=False)
+
+    def chance(self, observable: Observable) -> float:
+        """Compute the p-value of an observable, corrected by those of healthy recordings as in `calibrate`."""
+        return self.calibrate(null_key(observable), observable.chance)
+
+    def calibrate(self, key: str, chance: float) -> float:
+        """Correct a detector's p-value `chance` by the p-values that it stated for healthy recordings (`key`).
+
+        The result is the predictive chance P(u) of the module's docstring.
+        """
+        if key not in self._posteriors:
+            self._posteriors[key] = _inflation_posterior(self.surprisals.get(key, ()))
+        weights, inflations = self._posteriors[key]
+        log_chance = np.log(max(chance, np.finfo(float).tiny))
+        return min(float(weights @ np.exp(log_chance / inflations)), 1.0)
+
+    def uncalibrated_chance(self, key: str, chance: float) -> float:
+        """Invert `calibrate`: compute the p-value that a detector must state so that the calibrated one is `chance`.
+
+        If no p-value is small enough, the smallest normal float is returned.
+        """
+        max_surprisal = -np.log(np.finfo(float).tiny)
+        if self.calibrate(key, np.exp(-max_surprisal)) >= chance:
+            return float(np.finfo(float).tiny)
+        surprisal = find_root(lambda u: self.calibrate(key, np.exp(-u)) - chance, 0.0, max_surprisal)
+        return float(np.exp(-surprisal))
+
+
+def _inflation_posterior(surprisals: Sequence[float]) -> tuple[Array, Array]:
+    """Compute the posterior weights w_k and the values lambda_k (NODES + 1,); without surprisals both are [1]."""
+    priors = DECISION.null
+    if not len(surprisals):
+        return np.ones(1), np.ones(1)
+    log_inflation = np.append(0.0, np.linspace(0.0, np.log(priors.largest), NODES))
+    inflation = np.exp(log_inflation)
+    prior = np.exp(-log_inflation / priors.inflation)
+    prior[1:] *= priors.fails / prior[1:].sum()  # `fails`: fraction of machines with wrong p-values
+    prior[0] = 1.0 - priors.fails
+    log_posterior = np.log(prior) - len(surprisals) * log_inflation - float(np.sum(surprisals)) / inflation
+    return weigh_alternatives(log_posterior), inflation
+
+
+def null_key(observable: Observable) -> str:
+    """Return the key of an observable in `HealthyNull.surprisals`, such as "noise: noise of the pressures".
+
+    Observables without an onset are comparisons with healthy recordings, and share one key for their kind of data.
+    """
+    return comparison_key(observable.data) if observable.onset is None else f"{observable.data}: {observable.name}"
+
+
+def comparison_key(data: str) -> str:
+    """Return the key of comparisons of a kind of data in `HealthyNull.surprisals`, such as "details: against"."""
+    return f"{data}: against"
+
 
 #: Name of the third test, besides WITHIN and AGAINST: for leakage above the limit in the rig's file.
 LEVEL = "against the rig's file"
@@ -276,8 +360,8 @@ def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
 
     The p-value (`chance`) of each test is compared with the test's part of the probability. The p-value of a step is
     `StepTest.chance` (`estimate/change.py`). In the volume balance it was divided by the prior probability of the
-    leak's law (`find_leak_step` of `inference/leak_law.py`). It is calibrated (`null.py`) by the p-values that the same
-    test gave in healthy recordings (`healthy_null` of `detectors/observation.py`). The p-value of a rise is
+    leak's law (`find_leak_step` of `inference/leak_law.py`). It is calibrated (`HealthyNull`) by the p-values that the
+    same test gave in healthy recordings (`healthy_null` of `detectors/observation.py`). The p-value of a rise is
     `Rise.chance`, which rests on healthy recordings already; that of a level follows from the normal distribution.
     """
     from scipy.special import ndtr, ndtri  # standard normal distribution and its inverse

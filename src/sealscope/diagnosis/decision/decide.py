@@ -33,9 +33,8 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.diagnosis.decision.case import Case, LeakTest, step_key
+from sealscope.diagnosis.decision.case import Case, HealthyNull, LeakTest, step_key
 from sealscope.diagnosis.decision.explanations import probability_of
-from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.decision.reasons import leak_text, no_leak_text, text_of
 from sealscope.diagnosis.estimate.interval import WITHIN_95, Estimate
 from sealscope.diagnosis.inference.observable import LeakMeasure, Observed

@@ -9,7 +9,7 @@ The posterior of a set of events is proportional to
 Data that no event of the set changes have the factor 1. Thus a step of the noise together with a leak is explained by
 two events, which do not compete. The Bayes factor of a change is at most 1 / (-e p log p), where p is the probability
 of the change in a healthy recording, or 1 for p > 1/e (Sellke, Bayarri and Berger). p is calibrated by healthy
-recordings (`null`).
+recordings (`HealthyNull`).
 
 A model describes a change only to within a fraction, the misfit m (`priors.toml`). Therefore the logarithms of the
 Bayes factors of the same data are divided by 1 + 2 m B, where B is the largest of them. Alternative explanations then
@@ -32,7 +32,7 @@ import numpy as np
 
 from sealscope.diagnosis.estimate.population import weigh_alternatives
 from sealscope.diagnosis.inference.changes.volumes import VOLUMES
-from sealscope.diagnosis.inference.comparison.rise import RISE
+from sealscope.diagnosis.inference.comparison.levels import RISE
 from sealscope.diagnosis.inference.hypotheses import temper
 from sealscope.diagnosis.inference.observable import LeakRise, Observable
 from sealscope.diagnosis.priors.decision import DECISION

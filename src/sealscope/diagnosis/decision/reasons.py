@@ -22,7 +22,7 @@ from sealscope.diagnosis.verdict.evidence import (
     WITHIN,
     Evidence,
 )
-from sealscope.diagnosis.verdict.states import find_separation
+from sealscope.diagnosis.verdict.severity import find_separation
 from sealscope.paragraphs import join_names
 
 

@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.diagnosis.decision.case import step_key
-from sealscope.diagnosis.decision.null import HealthyNull, comparison_key, null_key
+from sealscope.diagnosis.decision.case import HealthyNull, comparison_key, null_key, step_key
 from sealscope.diagnosis.detectors.registry import Detector, detectors, log_failure, unusable_reason, validate_report
 from sealscope.diagnosis.healthy import Healthy, healthy_summaries, keep_once, learn_once
 from sealscope.diagnosis.inference.changes.features import SIGNALS, observe_signals
@@ -125,7 +124,7 @@ def _unusable_baseline(detector: Detector, healthy: Healthy) -> str | None:
 
 
 def healthy_surprisals(recording: Recording, rig: Rig, valves: Valves = Valves.OPEN) -> Mapping[str, float]:
-    """Compute the surprisal of each change within a healthy recording, by its key (`null.null_key`); cached.
+    """Compute the surprisal of each change within a healthy recording, by its key (`case.null_key`); cached.
 
     `valves`: those that are assumed at rest, open or shut.
     """

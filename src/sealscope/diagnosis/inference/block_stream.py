@@ -14,16 +14,19 @@ from numpy.typing import NDArray
 
 from sealscope.diagnosis.estimate.change import MIN_BLOCKS
 from sealscope.diagnosis.estimate.linear import Gaussian
-from sealscope.diagnosis.inference.balance_samples import (
+from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, Weighting, sorted_part_means
+from sealscope.diagnosis.inference.equations.balances import (
     CLIPPED_DIFFERENCE,
     HOLE,
+    FeedSums,
     absolute_offset,
+    feed_one_chamber,
+    find_rest_limits,
+    flag_circulation,
+    is_separate_at_rest,
     without_flow,
     without_lowering,
 )
-from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, Weighting, sorted_part_means
-from sealscope.diagnosis.inference.equations.balances import find_rest_limits, is_separate_at_rest
-from sealscope.diagnosis.inference.equations.feed import FeedSums, feed_one_chamber, flag_circulation
 from sealscope.diagnosis.inference.equations.signals import HALF_DIFFERENCE, Signals
 from sealscope.diagnosis.inference.equations.terms import MOVING_BIAS, Equation
 from sealscope.diagnosis.inference.machine_states import (

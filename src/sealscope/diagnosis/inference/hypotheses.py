@@ -5,10 +5,10 @@
 | valves at rest | `Valves` | `rest.shut_odds` | `regimes.shut_odds` | `VALVES` |
 | sign of the recorded flow | right, reversed | equal | `rows.flow_sign` | `FLOW_SIGN` |
 | held load without a flow | creeps by leakage, a loop holds it | equal | `RecordedBalance.creep_log_odds` | `CREEP` |
-| flow at rest | circulates, holds the load | `feed.circulation_odds` | `feed.flag_circulation` | `HoldCounts` |
-| chambers that a pump feeds | both, one at a time, each by its displacement | `feed` | `feed.FeedSums.find_feed` | |
+| flow at rest | circulates, holds the load | `feed.circulation_odds` | `balances.flag_circulation` | `HoldCounts` |
+| chambers that a pump feeds | both, one at a time, each by its displacement | `feed` | `FeedSums.find_feed` | |
 | zero of p_A - p_B | near 0, any | `zero` | `pressure_offset` | |
-| law of a leak | exponent of its flow | `size.laminar` | `leak_law`, `comparison.laws` | `LAWS` |
+| law of a leak | exponent of its flow | `size.laminar` | `leak_law`, `comparison.levels` | `LAWS` |
 | course of a leak | growth from its onset to the end | `growth` | `leak_flow`, `HeldChambers` | `GROWTHS` |
 
 The first four are the same in all recordings of a machine, so their log odds add up: those of the healthy recordings,
@@ -29,10 +29,11 @@ from enum import Enum
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sealscope.diagnosis.healthy import Number, Values, stored_array
-from sealscope.diagnosis.inference.equations.feed import HoldCounts
 from sealscope.diagnosis.priors.inference import INFERENCE
+from sealscope.recordings.motion import find_runs
 from sealscope.recordings.recording import Array
 
 
@@ -46,6 +47,31 @@ class Valves(Enum):
     OPEN = "open"
     SHUT = "shut"
     SURELY_SHUT = "surely shut"
+
+
+class HoldCounts(NamedTuple):
+    """Numbers of holds of an open circuit: with a pump `connected` to the cylinder, and with a flow `circulating`."""
+
+    connected: int = 0
+    circulating: int = 0
+
+    @classmethod
+    def measure(cls, is_held: NDArray[np.bool_], circulates: NDArray[np.bool_], rate: float) -> HoldCounts:
+        """Count the holds that last for `rest.shortest_hold` (`priors.toml`) or longer.
+
+        `is_held`, `circulates` (n - 1,): flags of the sampling intervals, the latter by `flag_circulation`; `rate`:
+        sampling rate [Hz].
+        """
+        min_length = INFERENCE.rest.shortest_hold * rate
+        runs = find_runs(is_held).tolist()
+        states = [bool(circulates[first]) for first, length in runs if length >= min_length]
+        return cls(connected=states.count(False), circulating=states.count(True))
+
+    @property
+    def log_odds(self) -> float:
+        """Log odds that the flow circulates in a further hold; those of `feed.circulation_odds` count as one hold."""
+        share = 1.0 / (1.0 + np.exp(-INFERENCE.feed.circulation_odds))
+        return float(np.log((self.circulating + share) / (self.connected + 1.0 - share)))
 
 
 class Unknown(NamedTuple):

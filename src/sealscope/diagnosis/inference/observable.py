@@ -17,7 +17,7 @@ import numpy as np
 from sealscope.diagnosis.estimate.change import StepTest
 from sealscope.diagnosis.estimate.interval import Estimate, Interval
 from sealscope.diagnosis.estimate.population import MIN_HEALTHY, ScatterPrior, estimate_variance, predict_estimate
-from sealscope.diagnosis.inference.comparison.rise import Rise
+from sealscope.diagnosis.inference.comparison.levels import Rise
 from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak, TotalLeakage
 from sealscope.signals.smoothing import TINY
 

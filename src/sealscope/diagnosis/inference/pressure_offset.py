@@ -35,7 +35,7 @@ import numpy as np
 from sealscope.diagnosis.estimate.change import MIN_BLOCKS, RANK_TOLERANCE, WALKS, largest_step_likelihood
 from sealscope.diagnosis.estimate.linear import Gaussian
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, estimate_leak_and_bias, offset_cost, sum_blocks
-from sealscope.diagnosis.inference.equations.feed import motions_of_side
+from sealscope.diagnosis.inference.equations.balances import motions_of_side
 from sealscope.diagnosis.inference.equations.terms import Equation
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.evaluation.scalar_search import find_minimum

@@ -32,13 +32,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.estimate.linear import Gaussian, solve
-from sealscope.diagnosis.inference.balance_samples import (
-    READ,
-    bridged_samples,
-    derive_drive_signals,
-    without_flow,
-    without_lowering,
-)
 from sealscope.diagnosis.inference.block_stream import MAX_BLOCK_TIME, MIN_BLOCK_TIME, BlockStream
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.delays import (
@@ -49,13 +42,20 @@ from sealscope.diagnosis.inference.delays import (
     drop_delay_columns,
 )
 from sealscope.diagnosis.inference.equations.balances import (
+    READ,
+    FeedSums,
+    bridged_samples,
+    derive_drive_signals,
     equations,
+    feed_one_chamber,
     find_rest_limits,
+    flag_circulation,
     shut_at_rest,
     with_delays,
     with_rests,
+    without_flow,
+    without_lowering,
 )
-from sealscope.diagnosis.inference.equations.feed import FeedSums, HoldCounts, feed_one_chamber, flag_circulation
 from sealscope.diagnosis.inference.equations.signals import Signals
 from sealscope.diagnosis.inference.equations.terms import (
     BIAS,
@@ -67,7 +67,7 @@ from sealscope.diagnosis.inference.equations.terms import (
     Equation,
     Flow,
 )
-from sealscope.diagnosis.inference.hypotheses import Valves
+from sealscope.diagnosis.inference.hypotheses import HoldCounts, Valves
 from sealscope.diagnosis.inference.pressure_offset import (
     area_mismatch,
     fit_pressure_offset,

@@ -23,7 +23,7 @@ old onsets are thinned out, which bounds the memory.
 
 Starts after a rest, oil that warms and other duties depart from a random walk, and raise M. While the baseline is
 learned, the largest M of each `WINDOW` blocks is therefore stored (`StepNull`). As for healthy recordings, the
-posterior of an inflation (`decision.null`) turns these values into the chance that M rises as high once more, by which
+posterior of an inflation (`decision.case`) turns these values into the chance that M rises as high once more, by which
 the threshold is set.
 
 The arithmetic is that of kernels on a record of fixed size (`kernel.step`), which controllers run, too.
@@ -40,7 +40,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.decision.null import HealthyNull
+from sealscope.diagnosis.decision.case import HealthyNull
 from sealscope.diagnosis.estimate.interval import Interval
 from sealscope.diagnosis.estimate.special import LOG_ZERO
 from sealscope.diagnosis.live.explanation import WINDOW

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from sealscope.calls import checked_call
+from sealscope.diagnosis.decision.case import HealthyNull
 from sealscope.diagnosis.decision.decide import decide
-from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.estimate.interval import UPPER_95, WITHIN_95, Estimate, Interval
 from sealscope.diagnosis.inference.observable import LeakMeasure, Observed
 from sealscope.diagnosis.live.estimates import (

@@ -13,7 +13,7 @@ class FalseAlarmPriors(PriorTable):
 
 
 class NullPriors(PriorTable):
-    """Prior on the error of the p-values that a detector states for healthy recordings (`decision.null`).
+    """Prior on the error of the p-values that a detector states for healthy recordings (`decision.case`).
 
     For right p-values the mean of -log(p-value) is 1. Wrong p-values are too small, and this mean is a factor > 1.
     """

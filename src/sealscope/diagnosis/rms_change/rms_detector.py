@@ -43,20 +43,26 @@ from sealscope.diagnosis.healthy import (
     Values,
     healthy_summaries,
 )
-from sealscope.diagnosis.inference.comparison.rise import Rise, rise_of_mixture
+from sealscope.diagnosis.inference.comparison.levels import Rise, rise_of_mixture
 from sealscope.diagnosis.inference.observable import Observable, Observed, Ringing
 from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
 from sealscope.diagnosis.verdict.evidence import RMS_CHANGE
 from sealscope.recordings.channels import CHAMBERS, ROUNDING, chambers_of
 from sealscope.recordings.corrections.gaps import flag_bridged
-from sealscope.recordings.cycle import find_cycle
-from sealscope.recordings.hydraulics import describe_missing_chambers
 from sealscope.recordings.joining import start_seconds
-from sealscope.recordings.motion import is_constant
-from sealscope.recordings.quality import is_mostly_clipped
+from sealscope.recordings.motion import find_cycle, is_constant
+from sealscope.recordings.quality import describe_missing_chambers, is_mostly_clipped
 from sealscope.recordings.recording import Array, Recording
-from sealscope.signals.details import QUANTITIES, details, find_inside, mean_squares, min_samples, segment_means
-from sealscope.signals.filters import IntArray, reach
+from sealscope.signals.details import (
+    QUANTITIES,
+    IntArray,
+    details,
+    find_inside,
+    mean_squares,
+    min_samples,
+    reach,
+    segment_means,
+)
 
 #: Wavelet quantities on which an alarm may rest: d1 is almost only noise, and d3d4 follows from d3 and d4.
 JUDGED = ("d2", "d3", "d4")

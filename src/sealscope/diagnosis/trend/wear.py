@@ -33,7 +33,7 @@ from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY, weigh_alt
 from sealscope.diagnosis.estimate.special import SD_PER_MEDIAN
 from sealscope.diagnosis.priors.trend import TREND
 from sealscope.recordings.recording import Array
-from sealscope.signals.filters import IntArray
+from sealscope.signals.details import IntArray
 from sealscope.units import DAYS_PER_MONTH, DAYS_PER_YEAR
 
 #: Standard deviation of a flat prior, over scatter and range of the values: its square leaves half of the digits.

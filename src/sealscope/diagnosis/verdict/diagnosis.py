@@ -12,8 +12,16 @@ import numpy as np
 
 from sealscope.diagnosis.verdict.evidence import AGAINST, LEAK, LEAKS, NO_LEAK, RMS_CHANGE, WITHIN, Evidence
 from sealscope.diagnosis.verdict.machine_sizes import AssumedMachine
-from sealscope.diagnosis.verdict.severity import RepairLimit, Severity, relative_leak, severity
-from sealscope.diagnosis.verdict.states import LEAK_OVER_LIMIT, MachineState, action_of, state_of
+from sealscope.diagnosis.verdict.severity import (
+    LEAK_OVER_LIMIT,
+    MachineState,
+    RepairLimit,
+    Severity,
+    action_of,
+    relative_leak,
+    severity,
+    state_of,
+)
 from sealscope.errors import InputError, MissingExtra
 from sealscope.recordings.quality import MISSING_CHANNEL, Finding
 from sealscope.recordings.recording import Recording

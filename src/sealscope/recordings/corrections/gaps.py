@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from sealscope.recordings.channels import Array, chambers_of
 from sealscope.recordings.corrections.clock import MAX_INTERVAL
-from sealscope.recordings.cycle import duty_signal, find_cycle
-from sealscope.recordings.motion import find_runs
+from sealscope.recordings.motion import duty_signal, find_cycle, find_runs
 from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.quality import flag_impossible, uniform_segments
 from sealscope.recordings.recording import Recording

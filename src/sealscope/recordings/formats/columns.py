@@ -16,8 +16,9 @@ from sealscope.paragraphs import join_names
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, UNUSED
 from sealscope.recordings.formats.headings.actuators import find_actuators
 from sealscope.recordings.formats.headings.formula import Formula, is_pure_number, parse_formula
-from sealscope.recordings.formats.headings.labels import WORDS, Label, split_square_brackets
-from sealscope.recordings.formats.headings.proposal import (
+from sealscope.recordings.formats.headings.labels import (
+    WORDS,
+    Label,
     ends_in,
     format_map,
     is_current_or_fraction,
@@ -25,6 +26,7 @@ from sealscope.recordings.formats.headings.proposal import (
     is_temperature,
     is_time,
     proposed_map,
+    split_square_brackets,
     split_unit,
     unit_of_time,
 )

@@ -26,18 +26,18 @@ from sealscope.paragraphs import format_count, join_names
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, Array
 from sealscope.recordings.formats.cells import MAX_WORD_FRACTION, parse_numbers
 from sealscope.recordings.formats.columns import CLOCK_LABEL, ColumnMap, Request, choose_columns
-from sealscope.recordings.formats.headings.labels import WORDS, Label
-from sealscope.recordings.formats.headings.proposal import is_time, unit_of_time
-from sealscope.recordings.formats.times.dates import find_order, stated_start
+from sealscope.recordings.formats.headings.labels import WORDS, Label, is_time, unit_of_time
 from sealscope.recordings.formats.times.row_order import COUNTERS, order_rows
 from sealscope.recordings.formats.times.timebase import (
     TimeBase,
     TimeState,
     combine_time_parts,
+    find_order,
     interpolate_samples,
     is_falling,
     nominal_rate,
     parse_stamps,
+    stated_start,
     time_base,
     timedelta_seconds,
 )

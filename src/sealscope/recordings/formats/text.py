@@ -37,9 +37,8 @@ from sealscope.recordings.formats.cells import (
     strip_unit,
 )
 from sealscope.recordings.formats.columns import Request, choose_columns
-from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.headings.labels import Label, is_time
 from sealscope.recordings.formats.headings.preamble import scope_start
-from sealscope.recordings.formats.headings.proposal import is_time
 from sealscope.recordings.formats.table import (
     MAX_VALUES,
     Clock,
@@ -61,12 +60,12 @@ from sealscope.recordings.formats.text_layout import (
     detect_layout,
     split_at_blanks,
 )
-from sealscope.recordings.formats.times.dates import is_day_first_beside
 from sealscope.recordings.formats.times.timebase import (
     TimeState,
     ambiguous_dates,
     explicit_order,
     is_day_first,
+    is_day_first_beside,
     is_falling,
     is_stamp,
     parse_stamps,

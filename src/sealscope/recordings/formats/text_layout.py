@@ -24,9 +24,15 @@ from sealscope.recordings.formats.cells import (
     remove_units,
 )
 from sealscope.recordings.formats.headings.descriptions import apply_descriptions, parse_scope_heading, split_pairs
-from sealscope.recordings.formats.headings.labels import WORDS, Label, is_unit, strip_word_before
+from sealscope.recordings.formats.headings.labels import (
+    WORDS,
+    Label,
+    has_known_word,
+    is_quantity,
+    is_unit,
+    strip_word_before,
+)
 from sealscope.recordings.formats.headings.preamble import parse_remarks, stated_rate
-from sealscope.recordings.formats.headings.proposal import has_known_word, is_quantity
 
 SNIFF = 64 * 1024  # bytes at the beginning of a file from which its format and layout are detected
 #: Beginning of the first line of logs written by Sealscope, before their description in JSON.

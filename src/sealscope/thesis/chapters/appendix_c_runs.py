@@ -14,8 +14,7 @@ import numpy as np
 
 from sealscope.recordings.channels import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
-from sealscope.signals.details import QUANTITIES, details, mean_squares
-from sealscope.signals.filters import reach
+from sealscope.signals.details import QUANTITIES, details, mean_squares, reach
 from sealscope.simulation.changes import ParameterDrift
 from sealscope.simulation.commands import polyline_from_table
 from sealscope.simulation.experiment import Experiment, throttle_values

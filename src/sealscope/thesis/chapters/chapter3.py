@@ -9,7 +9,7 @@ import numpy as np
 
 from sealscope.recordings.channels import CHAMBERS
 from sealscope.recordings.recording import Array
-from sealscope.signals.filters import discrete_wavelet
+from sealscope.signals.details import discrete_wavelet
 from sealscope.simulation.experiment import Experiment
 from sealscope.thesis.chapters.chapter4.cases import visible_pressure
 from sealscope.thesis.engine.context import Context

@@ -9,7 +9,7 @@ import numpy as np
 
 from sealscope.parameters import load_rig
 from sealscope.recordings.channels import CHAMBERS
-from sealscope.signals.filters import decomposition_filters, reach
+from sealscope.signals.details import decomposition_filters, reach
 from sealscope.signals.windows import WINDOW_SIZE
 from sealscope.thesis.chapters.appendix_c_runs import column
 from sealscope.thesis.chapters.chapter5 import TESTS

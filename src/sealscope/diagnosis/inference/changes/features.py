@@ -26,7 +26,7 @@ from sealscope.diagnosis.inference.changes.level_changes import MOTIONS, level_t
 from sealscope.diagnosis.inference.machine_states import is_in_motion, time_in_motion
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.priors.changes import CHANGES
-from sealscope.recordings.cycle import find_cycle
+from sealscope.recordings.motion import find_cycle
 from sealscope.recordings.recording import Array, Recording, compute_once
 from sealscope.signals.smoothing import TINY, medians, quantiles
 

@@ -41,7 +41,7 @@ from sealscope.diagnosis.inference.equations.signals import HALF_DIFFERENCE, cen
 from sealscope.diagnosis.inference.hypotheses import temper
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.priors.changes import CHANGES
-from sealscope.recordings.cycle import find_cycle
+from sealscope.recordings.motion import find_cycle
 from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.smoothing import TINY, quantiles
 

@@ -36,16 +36,21 @@ from numpy.typing import NDArray
 
 from sealscope.diagnosis.estimate.change import MIN_BLOCKS, Information, StepTest, step_test
 from sealscope.diagnosis.estimate.interval import WITHIN_95
-from sealscope.diagnosis.inference.balance_samples import READ, derive_drive_signals, samples_without_holes
 from sealscope.diagnosis.inference.block_stream import MAX_BLOCK_TIME
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, Weighting, sorted_part_means
-from sealscope.diagnosis.inference.equations.balances import circulation, locked
+from sealscope.diagnosis.inference.equations.balances import (
+    READ,
+    circulation,
+    derive_drive_signals,
+    locked,
+    samples_without_holes,
+)
 from sealscope.diagnosis.inference.equations.signals import Signals
 from sealscope.diagnosis.inference.equations.terms import LEAK, ORIFICE, Equation, Flow
 from sealscope.diagnosis.inference.machine_states import find_holds
 from sealscope.diagnosis.inference.rows.weak_form import Rows
 from sealscope.diagnosis.priors.inference import INFERENCE
-from sealscope.recordings.cycle import estimate_period, fundamental_frequency
+from sealscope.recordings.motion import estimate_period, fundamental_frequency
 from sealscope.recordings.recording import Array, Recording
 from sealscope.units import P_ATM
 

@@ -17,11 +17,14 @@ each width all z are normal about an unknown mean. These effects contribute to t
   standard error to a tenth of the flow, so five recordings that agree allow a smaller sigma than two do.
 - Sessions: recordings of one session share oil and set-up. The deviation tau of a session has a half-normal prior.
   Sessions are separated by date; undated recordings form one session.
-- Oil (`oil`): z has an uncertain slope in the temperature or in the viscous drop, so that a recording is the less
-  certain the further its oil is from the mean; unknown oil is covered by tau.
+- Oil (`oil_hypotheses`): leakage is proportional to the inverse of the viscosity. If the oil's temperature is known for
+  all recordings, z has an uncertain slope in the temperature; otherwise the viscous pressure drop of the motion
+  (`changes.motion_fit`) may show the viscosity. A recording is the less certain the further its oil is from the mean;
+  unknown oil is covered by tau.
 - Conditions (`find_unusual_conditions`): load and speed outside of the known range make a recording less certain.
 
-The rise follows the mixture over all of these. The priors are in `priors.toml`.
+The rise follows the mixture over all of these (`Rise`). The flow by which the recording exceeds the healthy ones also
+compares laws of a leak, and other terms (`compare_laws`). The priors are in `priors.toml`.
 
 Source: A. Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sections 3.2, 5.4 and 5.7; C. E. Rasmussen and C. K.
 I. Williams, Gaussian Processes for Machine Learning (2006), section 2.7 (an unknown mean).
@@ -34,21 +37,291 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.estimate.population import NODES, Mixture, Population, number_sessions
+from sealscope.diagnosis.estimate.interval import Interval
+from sealscope.diagnosis.estimate.linear import Gaussian
+from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY, NODES, Mixture, Population, number_sessions
 from sealscope.diagnosis.inference.blocks import ColumnRoles
-from sealscope.diagnosis.inference.comparison.oil import OilHypothesis, oil_hypotheses
 from sealscope.diagnosis.inference.comparison.recording_sums import (
     ComparedColumns,
     RecordingSums,
+    Resistance,
     coefficient_level,
     eliminate_unshared,
     estimate_leak_excess,
     find_unusual_conditions,
+    marginal_difference,
+    subtract_reference,
 )
-from sealscope.diagnosis.inference.comparison.rise import Rise, rise_of_mixture
+from sealscope.diagnosis.inference.equations.terms import AIR, LEAK, ORIFICE
+from sealscope.diagnosis.inference.hypotheses import compare_residuals
 from sealscope.diagnosis.inference.rows.weak_form import MAX_READING
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
+from sealscope.signals.smoothing import TINY
+
+#: `Observable.data` of the leakage against healthy recordings.
+RISE = "rise"
+#: Reach of a grid of rises [standard deviations].
+MAX_LOG = 4.0
+#: Parts of a mixture are omitted if their log weight is lower than the largest by more than this.
+NEGLIGIBLE = 16.0
+
+
+class Rise(NamedTuple):
+    """Amount by which a recording's leak coefficient exceeds that of healthy recordings, with its distribution.
+
+    - `value`, `deviation`: estimate and standard deviation, in the unit of the coefficient;
+    - `mixture`: distribution of `value` in a healthy recording. If None, `value` / `deviation` is Student's t with
+      `degrees_of_freedom`;
+    - `share`: fraction of the allowed false alarms that is left to this rise, by which its p-value is divided. It must
+      be 1 for `bound`, `interval` and `log_ratio_within`.
+    """
+
+    value: float
+    deviation: float
+    degrees_of_freedom: float
+    mixture: Mixture | None = None
+    share: float = 1.0
+
+    def share_alarms(self, share: float) -> Rise:
+        """Return a copy that gets only the fraction `share` of the allowed false alarms, as one of several tests."""
+        return self._replace(share=share)
+
+    def widen(self, variance: float) -> Rise:
+        """Add an error with the given `variance` to the rise; unchanged for a variance <= 0 or without a mixture."""
+        if self.mixture is None or not variance > 0.0:
+            return self
+        mixture = self.mixture._replace(deviations=np.sqrt(self.mixture.deviations**2 + variance))
+        return self._replace(deviation=float(np.sqrt(self.deviation**2 + variance)), mixture=mixture)
+
+    @property
+    def score(self) -> float:
+        """The estimated rise divided by its standard deviation."""
+        return self.value / self.deviation
+
+    @property
+    def chance(self) -> float:
+        """Probability that a healthy recording scores higher (one-sided p-value), divided by `share`; at most 1."""
+        from scipy.special import ndtr, stdtr
+
+        if self.mixture is None:
+            chance = float(stdtr(self.degrees_of_freedom, -self.score))
+        else:
+            weights, deviations, centres = self.mixture
+            chance = float(weights @ ndtr((centres - self.score * self.deviation) / deviations))
+        return min(chance / max(self.share, TINY), 1.0)
+
+    def threshold(self, chance: float) -> float:
+        """Compute the score whose p-value (the property `chance`) is the argument `chance`, between 0 and 1."""
+        from scipy.special import stdtrit
+
+        probability = 1.0 - chance * self.share
+        if self.mixture is None:
+            return float(stdtrit(self.degrees_of_freedom, probability))
+        return self.mixture.quantile(probability) / self.deviation
+
+    def log_ratio(self, rise: float, log_deviation: float = 0.0) -> float:
+        """Compute the log likelihood ratio of two hypotheses: the leak's coefficient rose by `rise`, and it did not.
+
+        `log_deviation`: standard deviation of the logarithm of the true rise about log(`rise`); the true rise is
+        exactly `rise`, in the unit of `value`, if it is 0 or if `rise` has no logarithm.
+        """
+        if log_deviation > 0.0 and rise > 0.0:
+            return self._log_ratio_lognormal(rise, log_deviation)
+        return self._log_density(self.value - rise) - self._log_density(self.value)
+
+    def log_ratio_within(self, rise: float, tail: float) -> float:
+        """Compute the log likelihood ratio of a rise by `rise` to no rise, robust to an outlying estimate `value`.
+
+        Both densities of `value` are at least the smaller of those of a healthy recording at its quantiles `tail` and
+        1 - `tail`: an estimate that is improbable with the rise and without it is evidence for neither.
+        """
+        tail_values = [self.threshold(chance) * self.deviation for chance in (tail, 1.0 - tail)]
+        min_log_density = min(self._log_density(value) for value in tail_values)
+        with_rise = max(self._log_density(self.value - rise), min_log_density)
+        return with_rise - max(self._log_density(self.value), min_log_density)
+
+    def _log_ratio_lognormal(self, rise: float, log_deviation: float) -> float:
+        """Compute the log likelihood ratio of a true rise with a log-normal prior (`log_ratio`) to no rise.
+
+        The integral over the prior uses a grid that resolves both the prior and the likelihood.
+        """
+        grid_deviations = np.linspace(-MAX_LOG, MAX_LOG, NODES)
+        grid = np.concatenate(
+            [rise * np.exp(log_deviation * grid_deviations), self.value + self.deviation * grid_deviations]
+        )
+        grid = np.unique(grid[grid > TINY])
+        z = np.log(grid / rise) / log_deviation
+        log_prior = -0.5 * z**2 - np.log(grid * log_deviation * np.sqrt(2.0 * np.pi))
+        log_densities = [self._log_density(self.value - true_rise) for true_rise in grid]
+        log_integrand = log_prior + log_densities - self._log_density(self.value)
+        log_max = float(log_integrand.max())
+        return log_max + float(np.log(max(np.trapezoid(np.exp(log_integrand - log_max), grid), TINY)))
+
+    def _log_density(self, value: float) -> float:
+        """Compute the log probability density of the estimate `value` in a healthy recording, up to a constant."""
+        if self.mixture is None:
+            z = value / self.deviation
+            if np.isinf(self.degrees_of_freedom):  # Student's t is then normal
+                return -0.5 * z * z
+            return float(-0.5 * (self.degrees_of_freedom + 1.0) * np.log1p(z * z / self.degrees_of_freedom))
+        weights, deviations, centres = self.mixture
+        log_weights = np.log(np.maximum(weights, np.finfo(float).tiny)) - np.log(deviations)
+        return float(np.logaddexp.reduce(log_weights - 0.5 * ((value - centres) / deviations) ** 2))
+
+    def bound(self) -> float:
+        """Compute the 95 % upper bound of the true rise, in the unit of `value`; a negative `value` counts as zero."""
+        # the score that a healthy recording exceeds with a probability of 95 % is negative
+        return max(self.value, 0.0) - self.threshold(BOUND_PROBABILITY) * self.deviation
+
+    def interval(self, probability: float = BOUND_PROBABILITY) -> tuple[float, float]:
+        """Compute the central interval (low, high) that contains the true rise with the given `probability`."""
+        tail = 0.5 - 0.5 * probability  # on either side of the interval
+        max_error, min_error = (self.threshold(chance) * self.deviation for chance in (tail, 1.0 - tail))
+        return self.value - max_error, self.value - min_error
+
+    @property
+    def normal_deviation(self) -> float:
+        """Standard error of the rise: that of a normal distribution whose 95 % interval has the width of `interval`."""
+        return Interval(self.value, *self.interval()).deviation
+
+
+def rise_of_mixture(predicted: Mixture, values: Array) -> Rise:
+    """Estimate the rise of a judged value over the value that healthy recordings predict for it.
+
+    `values` (s,): the judged value by s alternative estimates; `predicted`: mixture of predicted values of shape (s,
+    ...), with log weights. The rise is the median of judged minus predicted value over all estimates, and its standard
+    deviation is half the width of the central 68 % interval, infinite if no part has finite numbers.
+    """
+    judged = np.reshape(values, (-1, *[1] * (predicted.centres.ndim - 1)))  # (s, 1, ..., 1)
+    log_weights, deviations = predicted.weights.ravel(), predicted.deviations.ravel()
+    centres = (predicted.centres - judged).ravel()
+    max_log_weight = float(np.max(log_weights, initial=-np.inf, where=np.isfinite(log_weights + centres)))
+    is_counted = (log_weights > max_log_weight - NEGLIGIBLE) & np.isfinite(centres)
+    if not is_counted.any():  # impossible readings, of which nothing can be predicted
+        return Rise(float(values.mean()), deviation=np.inf, degrees_of_freedom=1.0)
+    weights = np.exp(log_weights[is_counted] - max_log_weight)
+    mixture = Mixture(weights / weights.sum(), deviations[is_counted], centres[is_counted])  # predicted minus judged
+    low, median, high = (mixture.quantile(probability) for probability in (0.16, 0.5, 0.84))
+    errors = mixture._replace(centres=mixture.centres - median)
+    return Rise(value=-median, deviation=0.5 * (high - low), degrees_of_freedom=np.inf, mixture=errors)
+
+
+class OilHypothesis(NamedTuple):
+    """Hypothesis on how the oil's viscosity changed the leakage of n + 1 recordings, the judged one last.
+
+    - `thinning` (n + 1,): predicted logarithm of the leakage, relative to the mean over the n healthy recordings;
+    - `variances` (n + 1,): variance of the error of each prediction, without the error of its slope;
+    - `log_probability`: log probability of the hypothesis, given the resistances to the motion;
+    - `slope_deviation`: relative standard deviation of the slope of `thinning` in temperature or pressure drop;
+    - `session_deviation`: standard deviation of a session's log leakage by unknown oil, 0 if the oil is known.
+    """
+
+    thinning: Array
+    variances: Array
+    log_probability: float = 0.0
+    slope_deviation: float = 0.0
+    session_deviation: float = 0.0
+
+
+def oil_hypotheses(recordings: Sequence[RecordingSums]) -> list[OilHypothesis]:
+    """List the hypotheses on how the oil changed the leakage of `recordings`, the judged one last, most probable first.
+
+    If all recordings have an oil temperature, it predicts the effect. Otherwise the viscous drop of the motion may show
+    the viscosity (`_oils_by_drop`), or the oil is unknown.
+    """
+    prior, zeros = INFERENCE.oil, np.zeros(len(recordings))
+    temperatures = [recording.oil_degC for recording in recordings if recording.oil_degC is not None]
+    if len(temperatures) == len(recordings):
+        warmer = np.array(temperatures) - np.mean(temperatures[:-1])
+        slope_deviation = prior.per_kelvin_deviation / prior.per_kelvin
+        return [OilHypothesis(prior.per_kelvin * warmer, zeros, slope_deviation=slope_deviation)]
+    # half of log(warmest), the range, is the standard deviation of the difference of two sessions: sqrt(2) times that
+    # of one session
+    unknown = OilHypothesis(zeros, zeros, session_deviation=float(np.sqrt(0.125) * np.log(prior.warmest)))
+    by_drop = _oils_by_drop(recordings, unknown.session_deviation)
+    if not by_drop:
+        return [unknown]
+    oils = [*by_drop, unknown._replace(log_probability=float(np.log1p(-prior.drop_tells)))]
+    return sorted(oils, key=lambda oil: -oil.log_probability)
+
+
+def _oils_by_drop(recordings: Sequence[RecordingSums], unknown_deviation: float) -> list[OilHypothesis]:
+    """List the hypotheses on the oil that follow from the viscous drop of the motion.
+
+    `recordings`: the healthy ones, then the judged one. The resistance to the motion at the top speed v, friction +
+    drop v, is known well. Friction and viscous drop are known less well, since friction varies with speed and load.
+    There are two hypotheses, in which the healthy friction and v are medians over the healthy recordings. Only the
+    first counts if the judged or the healthy friction is not positive:
+
+    - Friction changed, as if seals wore, and the drop is the fitted one.
+    - Friction was what it is in the healthy recordings, and drop = (resistance at v - healthy friction) / v.
+
+    Their probabilities, with the sum `oil.drop_tells` of `priors.toml`, follow from the judged friction and from the n
+    healthy drops. Splitting the resistance wrongly makes these drops scatter more. With an unknown scatter, their
+    density is proportional to S^(-(n - 1) / 2), where S is the sum of two kinds of squares: of the logarithms of the
+    drops about their mean, and of the relative errors of the drops.
+
+    Each hypothesis is listed twice: once with the judged drop as a sign of the oil, and once, with the small prior
+    probability `oil.drop_misleads`, without this sign, as if something else, such as a swollen seal, had changed the
+    judged drop. That changes the friction, too, which therefore has the density of the first hypothesis.
+
+    A drop predicts the thinning -`oil.per_drop` r (log drop - mean of the healthy ones), with the reliability r, the
+    variance of true drops over that of measured ones. A drop below its standard error is replaced by this error. A
+    recording without a drop gets the mean drop, and the error of unknown oil: `unknown_deviation`, the standard
+    deviation of the logarithm of the leakage. The list is empty if the judged recording has no drop, or none of the
+    healthy ones has.
+    """
+    prior, no_fit = INFERENCE.oil, np.full(len(Resistance._fields), np.nan)
+    friction, friction_error, drop, drop_error, speed = np.array(
+        [no_fit if recording.resistance is None else recording.resistance for recording in recordings]
+    ).T  # (n + 1,) each, NaN where unknown
+    is_known = np.isfinite(drop)
+    if not (is_known[-1] and is_known[:-1].any()):
+        return []
+    healthy = np.flatnonzero(is_known[:-1])
+    # friction resists the motion: the sign depends on the channel that shows the motion
+    sign = np.sign((friction / friction_error)[healthy].sum()) or 1.0
+    friction, drop = sign * friction, sign * drop
+    healthy_friction, top_speed = (float(np.median(values[healthy])) for values in (friction, speed))
+    drops, log_densities = [drop], np.zeros(1)  # one for each hypothesis
+    if min(healthy_friction, friction[-1]) > 0.0:  # else their ratio has no logarithm
+        drops.append(drop + (friction - healthy_friction) / top_speed)
+        change = float(np.log(friction[-1] / healthy_friction))
+        # prior deviations of this change under the two hypotheses: friction changed, or did not
+        deviations = np.array([prior.friction_changes, prior.friction_session])
+        log_densities = -0.5 * (change / deviations) ** 2 - np.log(deviations)
+    drops_by_hypothesis = np.maximum(drops, drop_error)  # (hypotheses, n + 1)
+    healthy_logs = np.log(drops_by_hypothesis[:, healthy])
+    squares = (healthy_logs - healthy_logs.mean(axis=1, keepdims=True)) ** 2
+    squares += (drop_error[healthy] / drops_by_hypothesis[:, healthy]) ** 2
+    log_scatters = -0.5 * (len(healthy) - 1) * np.log(squares.sum(axis=1))
+    log_misleads = np.log(prior.drop_misleads) + log_densities[0] + log_scatters
+    log_tells = np.log1p(-prior.drop_misleads) + log_densities + log_scatters
+    log_sum = np.logaddexp.reduce(np.concatenate([log_tells, log_misleads]))
+    log_probabilities = np.log(prior.drop_tells) + np.column_stack([log_tells, log_misleads]) - log_sum
+    variance = unknown_deviation**2
+    judged_unknown = is_known.copy()
+    judged_unknown[-1] = False
+    oils = list[OilHypothesis]()
+    for positive_drops, mean, probabilities in zip(
+        drops_by_hypothesis, healthy_logs.mean(axis=1), log_probabilities.tolist(), strict=True
+    ):
+        error_variance = (prior.per_drop * drop_error / positive_drops) ** 2
+        for is_informative, log_probability in zip((is_known, judged_unknown), probabilities, strict=True):
+            # variance of the true drop over that of the measured one
+            reliability = np.where(is_informative, variance / (variance + error_variance), 0.0)
+            log_ratio = np.where(is_informative, np.log(positive_drops) - mean, 0.0)
+            oils.append(
+                OilHypothesis(
+                    thinning=-prior.per_drop * reliability * log_ratio,
+                    variances=(1.0 - reliability) * variance,
+                    log_probability=log_probability,
+                    slope_deviation=prior.per_drop_deviation / prior.per_drop,
+                )
+            )
+    return oils
+
 
 #: Largest standard deviation between sessions on the grid, over its prior.
 MAX_SESSION_RATIO = 3.0
@@ -350,3 +623,83 @@ def leak_deviations_from_mean(recordings: Sequence[RecordingSums], columns: Sequ
     total = np.sum(all_sums, axis=0)
     rises = [estimate_leak_excess(sums, total - sums, columns, widths=np.ones(1))[0] for sums in all_sums]
     return np.array(rises) * ((len(recordings) - 1) / len(recordings))
+
+
+class LawFit(NamedTuple):
+    """Comparison of an orifice's law with the laminar law, for leakage above that of healthy recordings.
+
+    `regression`: slope of the flow sign(dp) sqrt(abs(dp)) of a unit orifice on dp = p_A - p_B [Pa^-0.5], with all other
+    terms eliminated; `log_ratio`: log likelihood ratio of the orifice to the laminar leak.
+    """
+
+    regression: float
+    log_ratio: float
+
+
+def compare_laws(
+    judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[ColumnRoles]
+) -> LawFit | None:
+    """Compare how well a turbulent leak through an orifice and a laminar leak explain a recording's excess flow.
+
+    Both are fitted alone, with all other columns integrated out, in all balances together; the coefficient may be
+    negative. The result is the log of the likelihood ratio of the orifice to the laminar leak (`compare_residuals`),
+    and the laminar coefficient that fits an orifice of coefficient 1. Return None if a balance has no column
+    of an orifice, if the recording has no information on one of the two leaks, or if their columns, both with the sign
+    of p_A - p_B, are not positively correlated.
+    """
+    if any(ORIFICE not in roles.names for roles in columns):
+        return None
+    gram, moments, left_square = _fit_excess(judged, baseline, columns, [LEAK, ORIFICE])
+    energies, cross = np.diag(gram), gram[0, 1]
+    if not energies.min() > 0.0 or not cross > 0.0:
+        return None
+    min_square = 1e-9 * abs(left_square) + TINY  # above rounding errors
+    square_laminar, square_orifice = np.maximum(left_square - moments**2 / energies, min_square)
+    return LawFit(float(cross / energies[0]), compare_residuals(square_orifice, square_laminar))
+
+
+def compare_with_leak(
+    judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[ColumnRoles], rival: str
+) -> float | None:
+    """Compare how well the leak and another term of the volume balance, `rival`, explain a recording's excess flow.
+
+    Returns the log likelihood ratio of rival to leak (`compare_residuals`). While the rival (for example an external
+    leak) is fitted, the leak may differ as it does between healthy recordings. A negative coefficient is not fitted,
+    except that of free air, of which there may be less. Return None if the balance has no column named `rival`, or if
+    the recording has no information on the leak or on the rival.
+    """
+    if any(rival not in roles.names for roles in columns):
+        return None
+    squares = []
+    for name in (LEAK, rival):
+        gram, moments, left_square = _fit_excess(judged, baseline, columns, [name], has_leak=name == rival)
+        energy, moment = float(gram[0, 0]), float(moments[0])
+        if not energy > 0.0:
+            return None
+        if name != AIR:
+            moment = max(moment, 0.0)
+        # above rounding errors
+        squares.append(max(left_square - moment**2 / energy, 1e-9 * abs(left_square) + TINY))
+    return compare_residuals(squares[1], squares[0])
+
+
+def _fit_excess(
+    judged: RecordingSums,
+    baseline: Sequence[RecordingSums],
+    columns: Sequence[ColumnRoles],
+    names: Sequence[str],
+    *,
+    has_leak: bool = False,
+) -> tuple[Array, Array, float]:
+    """Compute the sums of a fit of c tested terms, by `names`, to the residual of `judged` under the `baseline`.
+
+    All other terms are eliminated, the leak only if `has_leak` (`subtract_reference`). Returns sums over the equations:
+    Gram matrix (c, c) of the tested columns, their products (c,) with the residual, and the residual's sum of squares.
+    """
+    reference = np.sum([recording.sums for recording in baseline], axis=0)
+    total = Gaussian(np.zeros((len(names), len(names))), np.zeros(len(names)))
+    for e, roles in enumerate(columns):
+        tested = [roles.names.index(name) for name in names]
+        residual, nuisance, prior = subtract_reference(judged.sums[e], reference[e], roles, has_leak=has_leak)
+        total += marginal_difference(residual, tested, nuisance, prior)
+    return total.precision, total.moment, total.square

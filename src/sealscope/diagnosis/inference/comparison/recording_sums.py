@@ -328,7 +328,7 @@ class UnusualCondition(NamedTuple):
 
     `name`: "load" [Pa], "speed" (of the pump, as mean flow [m^3/s]) or "oil" (temperature [degC]), with its `value` in
     the recording; `log_excess`: magnitude of the log ratio of load or speed to the nearer end of the range. It is 0 for
-    oil, whose effect has an uncertain slope in temperature (`oil`), which already covers it.
+    oil, whose effect has an uncertain slope in temperature (`levels.oil_hypotheses`), which already covers it.
     """
 
     name: str

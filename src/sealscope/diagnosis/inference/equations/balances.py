@@ -1,19 +1,31 @@
-"""The volume balances of a machine, by its circuit and the channels that are recorded.
+"""The volume balances of a machine, by its circuit and the channels that are recorded, and the samples that they read.
 
 A balance consists of terms (`terms`). There is one of a cylinder whose pump or flow meter gives the flow; one for each
 chamber behind a servo valve; and one of a pump, or of a held load, while the piston stands still.
+
+In an open circuit (`feed_one_chamber`) the pump feeds one chamber at a time while the other drains to the tank. The
+coefficient of a term of motion is the area of the side that the pump feeds in this direction, whichever side
+carries the load; oil that the other chamber loses to the outside does not count. While the piston rests, the side that
+carries the load counts instead, by whose oil the load creeps. Compliances count on both sides, although the pump's flow
+shows that of the fed chamber only: without the other, more leaks are missed (decision 68).
+
+The samples are prepared for it: clips and holes are marked, the drive is derived, unknown flows are left out. That is
+done for whole recordings (`regimes`, `circuit.without_position`), for each block of a stream (`block_stream`), and for
+the curves of the workbench.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Mapping
+from collections.abc import Callable, Collection, Container, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sealscope.control.drive import Drive
 from sealscope.diagnosis.inference.equations.expressions import increments_of
-from sealscope.diagnosis.inference.equations.signals import Signals, interval_means
+from sealscope.diagnosis.inference.equations.signals import MIN_ABSOLUTE_PRESSURE, Signals, interval_means
 from sealscope.diagnosis.inference.equations.terms import (
     BIAS,
     BIAS_TERM,
@@ -49,13 +61,321 @@ from sealscope.diagnosis.inference.equations.terms import (
     metering_edge_terms,
     motion_term,
 )
-from sealscope.diagnosis.inference.machine_states import AVERAGING_TIME, NEVER, RestLimits, rest_limit
+from sealscope.diagnosis.inference.hypotheses import HoldCounts
+from sealscope.diagnosis.inference.machine_states import (
+    AVERAGING_TIME,
+    NEVER,
+    LoweringLimits,
+    RestLimits,
+    flag_lowering,
+    rest_limit,
+)
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.channels import METERS, flow_source
-from sealscope.recordings.recording import Array
+from sealscope.recordings.corrections.gaps import flag_holes
+from sealscope.recordings.motion import find_runs
+from sealscope.recordings.quality import find_rails
+from sealscope.recordings.recording import Array, Recording
+from sealscope.units import P_ATM
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
+
+#: Channels that balances read.
+READ = ("u", "theta", "omega", *METERS, "x", "p_1", "p_2", "p_A", "p_B")
+#: Name of a signal that is 1 in holes (long gaps of missing samples that were filled in), else 0; absent without holes.
+HOLE = "hole"
+#: Name of p_A - p_B as recorded, among the samples of a recording in which pressures are clipped.
+CLIPPED_DIFFERENCE = "p_A - p_B, clipped"
+
+
+def bridged_samples(recording: Recording, names: Collection[str]) -> dict[str, Array]:
+    """Return the samples (n,) of those channels `names` that are recorded, with clipped pressures as NaN.
+
+    Holes, i.e. long gaps of missing samples, keep the values with which the inspection filled them
+    (`corrections.gaps`); the additional entry `HOLE` is then 1 there and 0 elsewhere. If a pressure is clipped, the
+    additional entry `CLIPPED_DIFFERENCE` is p_A - p_B as recorded, for the pressure level of a block: clipped values
+    are closer to the true ones than the mean of the other samples.
+    """
+    samples, is_clipped = {}, False
+    is_hole = flag_holes(recording)
+    if is_hole.any():
+        samples[HOLE] = is_hole.astype(float)
+    for name, values in recording.channels.items():
+        if name in names:
+            # rails: values at which the pressure transducer clips
+            rails = list[float]()
+            if name.startswith("p_"):
+                finite = values[np.isfinite(values)]
+                rails = [rail.value for rail in find_rails(finite, recording.units[name])]
+            samples[name] = np.where(np.isin(values, rails), np.nan, values) if rails else values
+            is_clipped |= bool(rails)
+    if is_clipped and {"p_A", "p_B"} <= samples.keys():
+        samples[CLIPPED_DIFFERENCE] = recording["p_A"] - recording["p_B"]
+    return samples
+
+
+def samples_without_holes(recording: Recording, names: Collection[str]) -> dict[str, Array]:
+    """Return the samples (n,) of the channels `names` as `bridged_samples` does, but NaN in long gaps."""
+    samples = bridged_samples(recording, names)
+    is_hole = samples.pop(HOLE, np.zeros(0)) > 0.0
+    return {name: np.where(is_hole, np.nan, values) for name, values in samples.items()} if is_hole.any() else samples
+
+
+def derive_drive_signals(
+    samples: Mapping[str, Array], rig: Rig, rate: float, *, loaded: bool = False
+) -> dict[str, Array]:
+    """Add signals from a model of the drive to the samples of a recording, each an array (n,) by channel name.
+
+    `rate`: sampling rate [Hz]. The added entry `START` is exp(-t/lag) at the time t since the first sample: the effect
+    of the drive's unknown initial state decays with the time constant lag. If only the command u shows the pump's flow,
+    the drive's response to u is added as the pump's speed "omega" [rad/s], NaN where u is missing. If `loaded` is true,
+    the drive responds to the load p_A - p_B as well. Otherwise the droop of the real speed under load counts as
+    leakage.
+    """
+    drive = Drive.from_rig(rig)
+    derived = {START: np.exp(-np.arange(len(samples["p_A"])) / (rate * drive.lag))}
+    if flow_source(samples) == "u":
+        u = _hold_missing(samples["u"])
+        load = np.zeros(len(u))
+        if loaded:
+            dp = _hold_missing(samples["p_A"] - samples["p_B"])
+            # the order of the pump's ports is unknown: the load is dp or -dp, whichever correlates positively with u
+            load = dp if float((u - u.mean()) @ (dp - dp.mean())) >= 0.0 else -dp
+        speed = drive.speed(u, load, rate)
+        derived["omega"] = np.where(np.isnan(samples["u"]), np.nan, speed)
+    return {**samples, **derived}
+
+
+def _hold_missing(values: Array) -> Array:
+    """Replace each missing value (NaN) of an array (n,) by the last known one; by 0 before the first."""
+    last = np.maximum.accumulate(np.where(np.isnan(values), -1, np.arange(len(values))))
+    return np.where(last < 0, 0.0, values[last])
+
+
+def without_lowering(
+    samples: Mapping[str, Array], rate: float, balance: Equation, limits: LoweringLimits | None = None
+) -> dict[str, Array]:
+    """Set the channel of the pump's flow to NaN while the piston moves past the resting pump (`flag_lowering`).
+
+    `samples`: arrays by channel name at the `rate` [Hz]; `balance`: volume balance, whose left side is the pump's flow;
+    `limits`: as in `flag_lowering`.
+    """
+    signals = Signals(samples, rate)
+    difference = signals.compute_pressure_difference()
+    is_lowered = flag_lowering(balance.left(signals), samples["x"], difference, rate, limits)
+    return without_flow(samples, is_lowered)
+
+
+def without_flow(samples: Mapping[str, Array], is_unknown: NDArray[np.bool_]) -> dict[str, Array]:
+    """Set the channel of the pump's flow to NaN on either side of the sampling intervals that `is_unknown` flags."""
+    source = flow_source(samples)  # not None: the balance has a recorded flow
+    if source is None or not is_unknown.any():
+        return dict(samples)
+    is_touched = np.append(is_unknown, False) | np.append(False, is_unknown)
+    return {**samples, source: np.where(is_touched, np.nan, samples[source])}
+
+
+def absolute_offset(pressure: Array) -> float:
+    """Compute absolute minus gauge pressure [Pa] for a sensor with the readings `pressure` (n,) [Pa].
+
+    It is the atmospheric pressure, or more where the lowest reading would otherwise lie below `MIN_ABSOLUTE_PRESSURE`.
+    """
+    finite = pressure[np.isfinite(pressure)]
+    min_reading = float(np.min(finite)) if finite.size else 0.0
+    return max(P_ATM, MIN_ABSOLUTE_PRESSURE - min_reading)
+
+
+#: Side of the terms of leaks to the outside, by their names.
+_SIDES = {term.name: side for side in "AB" for term in (external_leak_term(side), compensated_leak_term(side))}
+
+
+class FeedSums(NamedTuple):
+    """Sums over the time in which pump and piston move, which show how an open circuit's pump feeds the chambers.
+
+    They add up over the parts of a recording, so that a stream learns them block by block.
+
+    Parameters
+    ----------
+    volumes : pair of floats
+        Volume of the pump [m^3], > 0, while x grows and while it falls.
+    distances : tuple of 4 floats
+        Distance of the piston [m], > 0, in each of `MOTIONS`.
+    work : float
+        Sum of the products of the increments of volume and distance [m^4]: > 0 if flow and position have one sense.
+    delivered, time : float, float
+        Volume that the pump delivers either way [m^3], and the time [s] over which its flow is known.
+    """
+
+    volumes: tuple[float, ...] = (0.0, 0.0)
+    distances: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+    work: float = 0.0
+    delivered: float = 0.0
+    time: float = 0.0
+
+    @classmethod
+    def measure(cls, equation: Equation, signals: Signals, span: slice = slice(None)) -> FeedSums:
+        """Sum over the sampling intervals `span` of the signals, which have limits of rest."""
+        volume, step = equation.left(signals)[span], signals.step("x")[span]
+        is_known = (signals.moving(equation.left)[span] > 0.0) & np.isfinite(volume)
+        is_counted = is_known & np.isfinite(step)
+        # of a coarse encoder most increments are 0, so that its averaged speed tells the direction
+        weights = {motion: signals.direction_weights(*motion)[span][is_counted] for motion in MOTIONS.values()}
+        counted_volume, counted_step = volume[is_counted], step[is_counted]
+        volumes = [
+            abs(float((weights[outward, True] + weights[outward, False]) @ counted_volume)) for outward in (True, False)
+        ]
+        return cls(
+            volumes=tuple(volumes),
+            distances=tuple(abs(float(weight @ counted_step)) for weight in weights.values()),
+            work=float(counted_volume @ counted_step),
+            delivered=float(np.abs(volume[is_known]).sum()),
+            time=float(np.count_nonzero(is_known) * signals.dt),
+        )
+
+    def add(self, other: FeedSums) -> FeedSums:
+        """Return the sums over two parts of a recording."""
+        return FeedSums(
+            volumes=tuple(map(sum, zip(self.volumes, other.volumes, strict=True))),
+            distances=tuple(map(sum, zip(self.distances, other.distances, strict=True))),
+            work=self.work + other.work,
+            delivered=self.delivered + other.delivered,
+            time=self.time + other.time,
+        )
+
+    @property
+    def ways(self) -> tuple[float, float]:
+        """Distance [m] while x grows, and while it falls."""
+        out_A, out_B, in_A, in_B = self.distances
+        return out_A + out_B, in_A + in_B
+
+    @property
+    def flow_per_speed(self) -> tuple[float, float]:
+        """Volume over distance [m^2] while x grows, and while it falls, both of which must have been recorded."""
+        (volume_out, volume_in), (way_out, way_in) = self.volumes, self.ways
+        return volume_out / way_out, volume_in / way_in
+
+    @property
+    def mean_flow(self) -> float | None:
+        """Mean flow in motion [m^3/s], None without motion."""
+        return self.delivered / self.time if self.time > 0.0 else None
+
+    def find_feed(self, area_ratio: float) -> Feed:
+        """Find the chamber that the pump feeds while x grows: that of the larger area if more flow moves the piston.
+
+        Flows are compared per distance, whatever the signs of flow and position. If the areas differ by less than these
+        ratios scatter (`feed.scatter` of `priors.toml`), it is A if the flow is positive while x grows. `area_ratio`:
+        that of `Equation`.
+        """
+        areas_tell = abs(float(np.log(area_ratio))) > INFERENCE.feed.scatter
+        if areas_tell and min(self.ways) > 0.0:
+            flow_out, flow_in = self.flow_per_speed
+            feeds_A = (flow_out > flow_in) == (area_ratio < 1.0)
+        else:
+            feeds_A = self.work >= 0.0
+        sense = float(np.sign(self.work))  # of the flow while x grows
+        return Feed("A" if feeds_A else "B", sense if feeds_A else -sense)
+
+
+class Feed(NamedTuple):
+    """Order in which the pump of an open circuit feeds the chambers.
+
+    `outward`: chamber that it feeds while x grows; `sign_A`: sign of its flow while it feeds A, 0 if it never moves.
+    """
+
+    outward: Literal["A", "B"]
+    sign_A: float
+
+
+def feed_one_chamber(equation: Equation, feed: Feed) -> Equation:
+    """Adapt the volume balance of a cylinder to a pump that feeds one chamber at a time.
+
+    The terms of motion count the creep of a piston at rest with the area of the side that carries the load. A leak to
+    the outside counts while its chamber is fed or, while the pump rests, carries the load. The signals from which the
+    terms are computed must have limits of rest.
+    """
+    adapted = equation._replace(fed_outward=feed.outward)
+
+    def adapt(term: Term) -> Term:
+        """Adapt one term."""
+        if term.name in MOTIONS:
+            return term.with_increments(partial(_carried_increments, term=term, equation=adapted))
+        if term.name in _SIDES:
+            counted = partial(_counted_increments, term=term, left=equation.left, sign_A=feed.sign_A)
+            return term.with_increments(counted)
+        return term
+
+    return adapted._replace(terms=tuple(map(adapt, equation.terms)))
+
+
+def motions_of_side(equation: Equation, side: str) -> list[str]:
+    """Return the names of the terms of motion (`MOTIONS`) whose coefficient is the piston's area on `side` "A" or "B".
+
+    In a closed circuit that is the side that carries the load, otherwise the one that the pump feeds.
+    """
+    if not equation.fed_outward:
+        return [name for name in MOTIONS if name.endswith(f"{side} carries")]
+    return [name for name, (outward, _) in MOTIONS.items() if outward == (equation.fed_outward == side)]
+
+
+def flag_circulation(
+    equation: Equation, signals: Signals, mean_flow: float | None, healthy_holds: HoldCounts | None = None
+) -> NDArray[np.bool_]:
+    """Flag the sampling intervals (n - 1,) in which the pump's flow probably circulates to the tank, past the cylinder.
+
+    Valves of an open circuit may be in neutral while the pump turns and the piston rests. Otherwise the pump holds the
+    load, and its flow is what leaks and compresses the oil. The two are told apart for each hold by its mean flow, as a
+    fraction f of that in motion. A flow that circulates has any fraction up to 1. That of a pump that holds the load is
+    a log-normal one, with the median `feed.holding_flow` and the spread `feed.spread` (`priors.toml`); or, with the
+    probability `size.present`, it has any fraction up to 1 as well, since a leak stalls the piston. The log odds of a
+    flow that circulates are those of `healthy_holds`, the holds of the healthy recordings. Holds that are shorter than
+    `rest.shortest_hold`, in which a pump builds up a pressure, have no leak and the prior odds. Nothing is flagged if f
+    is unknown. Each block of a stream judges a hold by the part of it that the block's samples contain. `mean_flow`:
+    `FeedSums.mean_flow`.
+    """
+    prior, healthy_log_odds = INFERENCE.feed, (healthy_holds or HoldCounts()).log_odds
+    flow, is_held = np.abs(equation.left(signals)), signals.holding(equation.left) > 0.0
+    circulates = np.zeros(len(flow), dtype=bool)
+    if not (mean_flow and is_held.any()):
+        return circulates
+    for first, length in find_runs(is_held).tolist():
+        hold = slice(first, first + length)
+        flow_held = flow[hold][np.isfinite(flow[hold])] * signals.rate
+        if not flow_held.any():
+            continue
+        fraction = float(flow_held.mean()) / mean_flow
+        deviation = np.log(fraction / prior.holding_flow) / prior.spread
+        density = np.exp(-0.5 * deviation**2) / (fraction * prior.spread * np.sqrt(2.0 * np.pi))
+        is_lasting = length >= INFERENCE.rest.shortest_hold * signals.rate
+        leaks, log_odds = (INFERENCE.size.present, healthy_log_odds) if is_lasting else (0.0, prior.circulation_odds)
+        # the density of f is 1 if the flow circulates or leaks, also for a few f above 1
+        circulates[hold] = log_odds - np.log(max((1.0 - leaks) * density + leaks, np.finfo(float).tiny)) > 0.0
+    return circulates
+
+
+def _counted_increments(signals: Signals, *, term: Term, left: Callable[[Signals], Array], sign_A: float) -> Array:
+    """Compute the increments (n - 1,) of a leak to the outside, 0 while neither the pump's flow nor a load shows it.
+
+    `left`: left side of the volume balance, the pump's flow; `sign_A`: its sign while the pump feeds A.
+    """
+    turns = signals.moving(left) + signals.holding(left) > 0.0  # the pump
+    counts_A = np.where(turns, sign_A * left(signals) > 0.0, interval_means(signals.carried_by_A))
+    return np.asarray(term.increments(signals) * (counts_A if _SIDES[term.name] == "A" else 1.0 - counts_A))
+
+
+def _carried_increments(signals: Signals, *, term: Term, equation: Equation) -> Array:
+    """Compute the increments (n - 1,) of a term of motion whose creep at rest moves the area that carries the load.
+
+    While pump or piston rests, the increments are multiplied by the area of the side that carries the load, over that
+    of the side that the pump feeds in this direction.
+    """
+    _, by_A = MOTIONS[term.name]
+    feeds_A = term.name in motions_of_side(equation, "A")
+    area_B = equation.area_ratio  # over the area of A
+    factor = (1.0 if by_A else area_B) / (1.0 if feeds_A else area_B)
+    is_moving = signals.moving(equation.left)
+    return np.asarray(term.increments(signals) * np.where(is_moving > 0.0, 1.0, factor))
+
 
 #: Terms of the balance of a cylinder whose flow is that of a pump, or of a meter in one of its lines.
 _CYLINDER = (
@@ -252,7 +572,7 @@ def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
     """Return the volume balance of a pump over whole cycles or at standstill; None if circuit or channels allow none.
 
     The piston then displaces no net volume, so that the position need not be known. The signals must contain `START`
-    (`balance_samples.derive_drive_signals`). The offset of the flow, which cannot be separated from leakage under a
+    (`derive_drive_signals`). The offset of the flow, which cannot be separated from leakage under a
     steady load, is assumed to be zero.
     """
     left = pump_volume(rig, channels)
@@ -305,7 +625,7 @@ def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array
     """Return a function that computes from `Signals` the volume [m^3] that the pump delivers in each sampling interval.
 
     The volume follows from the best recorded channel (`flow_source`): the pump's angle, its speed, a flow meter, or the
-    command, from which the speed has been derived (`balance_samples.derive_drive_signals`). Return None if none of them
+    command, from which the speed has been derived (`derive_drive_signals`). Return None if none of them
     is recorded, or only the command of a pump that does not feed the chambers.
     """
     source = flow_source(channels)

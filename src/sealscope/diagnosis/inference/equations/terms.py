@@ -93,7 +93,7 @@ class Flow(Enum):
     """Source of the flow in a volume balance.
 
     `PUMP`: the pump's angle or speed; `METER`: a flow meter between pump and cylinder; `SUPPLY`: one in the supply line
-    of a valve; `COMMAND`: the command u, from which a speed is computed (`balance_samples.derive_drive_signals`);
+    of a valve; `COMMAND`: the command u, from which a speed is computed (`balances.derive_drive_signals`);
     `VALVE`: the opening of a servo valve, with one balance for each chamber; `CREEP`: nothing but the creep of a load
     that valves hold.
     """

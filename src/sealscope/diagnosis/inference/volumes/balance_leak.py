@@ -13,10 +13,8 @@ from sealscope.diagnosis.estimate.interval import UPPER_95, WITHIN_95, Estimate,
 from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY, Mixture, weigh_alternatives
 from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
 from sealscope.diagnosis.inference.circuit.holds.leaks import growth_factor
-from sealscope.diagnosis.inference.comparison.laws import compare_laws
-from sealscope.diagnosis.inference.comparison.levels import held_rise, rise
+from sealscope.diagnosis.inference.comparison.levels import Rise, compare_laws, held_rise, rise
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums, find_unusual_conditions
-from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.equations.terms import Flow
 from sealscope.diagnosis.inference.hypotheses import LAWS
 from sealscope.diagnosis.inference.leak_law import mixture_flow

@@ -23,11 +23,7 @@ from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY, weigh_alternatives
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.hypotheses import GROWTHS, LAWS
-from sealscope.diagnosis.inference.leak_law import (
-    apparent_conductances,
-    law_flows,
-    mixture_flow,
-)
+from sealscope.diagnosis.inference.leak_law import apparent_conductances, law_flows, mixture_flow
 from sealscope.diagnosis.inference.regimes import normal_log_density
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array

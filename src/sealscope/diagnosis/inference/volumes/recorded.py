@@ -20,7 +20,6 @@ from sealscope.diagnosis.estimate.change import (
 from sealscope.diagnosis.estimate.interval import WITHIN_95, Estimate, Interval
 from sealscope.diagnosis.estimate.linear import Gaussian
 from sealscope.diagnosis.estimate.population import weigh_alternatives
-from sealscope.diagnosis.inference.balance_samples import READ, derive_drive_signals
 from sealscope.diagnosis.inference.blocks import (
     Blocks,
     ColumnRoles,
@@ -43,8 +42,12 @@ from sealscope.diagnosis.inference.circuit.holds.recorded_hold import (
 from sealscope.diagnosis.inference.circuit.without_position import recorded_oil_loss_tests
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums, block_weights
 from sealscope.diagnosis.inference.delays import DelayChange, DelayTest
-from sealscope.diagnosis.inference.equations.balances import find_rest_limits
-from sealscope.diagnosis.inference.equations.feed import motions_of_side
+from sealscope.diagnosis.inference.equations.balances import (
+    READ,
+    derive_drive_signals,
+    find_rest_limits,
+    motions_of_side,
+)
 from sealscope.diagnosis.inference.equations.signals import MIN_ABSOLUTE_PRESSURE, Signals, interval_means
 from sealscope.diagnosis.inference.equations.terms import CYLINDER, LAG, LINES, TURNING, Equation, Flow
 from sealscope.diagnosis.inference.hypotheses import Valves

@@ -18,15 +18,19 @@ from sealscope.diagnosis.estimate.linear import Gaussian
 from sealscope.diagnosis.estimate.population import MIN_HEALTHY, excess_error
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
-from sealscope.diagnosis.inference.comparison.laws import compare_laws, compare_with_leak
-from sealscope.diagnosis.inference.comparison.levels import held_pump_rise, rise
-from sealscope.diagnosis.inference.comparison.oil import oil_hypotheses
+from sealscope.diagnosis.inference.comparison.levels import (
+    RISE,
+    compare_laws,
+    compare_with_leak,
+    held_pump_rise,
+    oil_hypotheses,
+    rise,
+)
 from sealscope.diagnosis.inference.comparison.recording_sums import (
     RecordingSums,
     coefficient_level,
     marginal_difference,
 )
-from sealscope.diagnosis.inference.comparison.rise import RISE
 from sealscope.diagnosis.inference.equations.terms import AIR, LEAK, SPEED_LOSS, TURNING
 from sealscope.diagnosis.inference.observable import Observable, compare_with_healthy
 from sealscope.diagnosis.priors.inference import INFERENCE

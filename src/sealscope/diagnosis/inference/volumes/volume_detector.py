@@ -11,22 +11,19 @@ import numpy as np
 from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.estimate.population import ScatterPrior
 from sealscope.diagnosis.healthy import Healthy, healthy_summaries
-from sealscope.diagnosis.inference.balance_samples import READ
 from sealscope.diagnosis.inference.block_stream import min_samples_for_step
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.circuit.without_position import cycle_balances
-from sealscope.diagnosis.inference.comparison.levels import leak_deviations_from_mean, rise
+from sealscope.diagnosis.inference.comparison.levels import Rise, leak_deviations_from_mean, rise
 from sealscope.diagnosis.inference.comparison.recording_sums import (
     BalanceSummary,
     RecordingSums,
     find_unusual_conditions,
     motion_change,
 )
-from sealscope.diagnosis.inference.comparison.rise import Rise
-from sealscope.diagnosis.inference.equations.balances import circulation, equations, locked, shut_at_rest
-from sealscope.diagnosis.inference.equations.feed import HoldCounts
+from sealscope.diagnosis.inference.equations.balances import READ, circulation, equations, locked, shut_at_rest
 from sealscope.diagnosis.inference.equations.terms import HOLDING, TURNING, Flow
-from sealscope.diagnosis.inference.hypotheses import PRIOR_ODDS, VALVES, MachineOdds, Valves
+from sealscope.diagnosis.inference.hypotheses import PRIOR_ODDS, VALVES, HoldCounts, MachineOdds, Valves
 from sealscope.diagnosis.inference.observable import Observable, Observed, compare_estimates
 from sealscope.diagnosis.inference.regimes import RecordedBlocks, RegimeBlocks, add_pump_columns, recorded_blocks
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak

@@ -16,8 +16,9 @@ from typing import NamedTuple
 
 from sealscope.errors import InputError
 from sealscope.paragraphs import join_names
-from sealscope.recordings.formats.headings.labels import WORDS, Label
-from sealscope.recordings.formats.headings.proposal import (
+from sealscope.recordings.formats.headings.labels import (
+    WORDS,
+    Label,
     find_name_and_unit,
     find_sides,
     guess_channel,

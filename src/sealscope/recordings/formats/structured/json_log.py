@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from sealscope.errors import InputError
 from sealscope.recordings.formats.cells import is_missing
 from sealscope.recordings.formats.columns import Request
-from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.headings.labels import Label, is_time
 from sealscope.recordings.formats.headings.preamble import collect_attributes, stated_rate
-from sealscope.recordings.formats.headings.proposal import is_time
 from sealscope.recordings.formats.structured.tree import iter_series
 from sealscope.recordings.formats.table import RecordingFields, Series, build_fields, check_size, check_texts
 from sealscope.recordings.formats.text_layout import SNIFF, detect_encoding
