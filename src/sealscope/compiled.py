@@ -75,10 +75,11 @@ def source_hash(root: Path) -> str:
     digest = hashlib.sha256()
     for package in _COMPILED_PACKAGES:
         # .toml: numbers, such as priors, that are compiled into kernels as constants
-        files = sorted(path for path in (root / package).rglob("*") if path.suffix in (".py", ".toml"))
-        for path in files or [root / package]:  # an entry that is itself a file contains no `files`
-            digest.update(path.relative_to(root).as_posix().encode() + b"\0")
-            digest.update(path.read_bytes())
+        paths = (f"{folder}/{name}" for folder, _, names in os.walk(root / package) for name in names)
+        files = sorted(path for path in paths if path.endswith((".py", ".toml")))
+        for path in files or [f"{root}/{package}"]:  # an entry that is itself a file contains no `files`
+            digest.update(path.removeprefix(f"{root}").encode() + b"\0")
+            digest.update(Path(path).read_bytes())
     return digest.hexdigest()
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache, lru_cache
 from operator import attrgetter
@@ -470,8 +471,13 @@ def _build_part(model: type[P], path: str, entries: Mapping[str, ParameterEntry]
 def _qualify_symbol(full_name: str, text: str) -> str:
     """Replace the symbol at the beginning of a message by the parameter's dotted name, unless the symbol is unique."""
     symbol = full_name.rpartition(".")[2]
-    is_unique = sum(name.rpartition(".")[2] == symbol for name in declared_names()) <= 1
-    return text if is_unique else full_name + text[len(symbol) :]
+    return text if _symbol_counts()[symbol] <= 1 else full_name + text[len(symbol) :]
+
+
+@cache
+def _symbol_counts() -> Counter[str]:
+    """Count the parameters that have each symbol."""
+    return Counter(name.rpartition(".")[2] for name in declared_names())
 
 
 @cache

@@ -23,7 +23,6 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from functools import cache, lru_cache
 from importlib.resources import files
 from itertools import combinations, product
@@ -78,8 +77,8 @@ class Event:
 
 @lru_cache(maxsize=4096)
 def _matches(key: str, patterns: tuple[str, ...]) -> bool:
-    """Return True if the `key` "data: name" of an observable matches one of the patterns; "*" stands for any text."""
-    return any(fnmatchcase(key, pattern) for pattern in patterns)
+    """Return True if the `key` "data: name" of an observable matches one of the patterns; a last "*" is any text."""
+    return any(key.startswith(pattern[:-1]) if pattern.endswith("*") else key == pattern for pattern in patterns)
 
 
 @cache
