@@ -384,14 +384,26 @@ def measure_service(seconds: float, actuators: int) -> dict[str, str]:
 
 
 def growth(folder: Path, share: float) -> dict[str, float]:
-    """Measure the exponents by which the time of a verdict grows with samples, channels and healthy recordings."""
+    """Measure the exponents by which the time of a verdict, and of a commissioning, and the peak memory grow.
+
+    They grow with the samples of a recording, with its channels, and with the number of healthy recordings. Three
+    channels are the least with a volume balance, three recordings the least that are checked against each other.
+    """
     names = ["p_A", "p_B", "x", "omega", "T_oil"]
-    minutes, counts, widths = (15.0 * share, 30.0 * share, 60.0 * share), (2, 4, 8), (2, 4, 5)
+    minutes, counts, widths = (15.0 * share, 30.0 * share, 60.0 * share), (2, 4, 8), (3, 4, 5)
     files, long = press(folder, 9, 10.0 * share, 50.0), press(folder, 1, 20.0 * share, 200.0)
     rows = {
         "samples": (minutes, [of_library("first", press(folder, 1, length, 200.0)) for length in minutes]),
         "healthy recordings": (counts, [of_library("first", files[: 1 + count]) for count in counts]),
         "channels": (widths, [of_library("first", long, channels=names[:count]) for count in widths]),
+        "samples of a commissioning": (
+            minutes,
+            [of_library("commission", press(folder, 3, length, 10.0)) for length in minutes],
+        ),
+        "recordings of a commissioning": (
+            (3, 6, 12),
+            [of_library("commission", press(folder, count, 15.0 * share, 10.0)) for count in (3, 6, 12)],
+        ),
     }
     exponents = {}
     for title, (sizes, calls) in rows.items():
