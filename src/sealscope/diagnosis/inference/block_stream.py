@@ -452,15 +452,16 @@ class SignEvidence(SavedAttributes):
         for roles, gram, count, motions, loads in zip(
             self._columns, self._grams, self._counts, self._motions, self._loads, strict=True
         ):
-            motion_z = flow_sign.compute_z_score(*motions[0]) if roles.piston else 0.0
+            motion_z = flow_sign.z_score(*motions[0].tolist()) if roles.piston else 0.0
             leak_z = _leak_z_score(gram, roles, int(count))
-            odds_by_balance.append(float(flow_sign.compute_log_odds(leak_z, loads, motion_z)))
+            difference_sums, force_sums = loads.tolist()
+            odds_by_balance.append(flow_sign.sum_log_odds(leak_z, difference_sums, force_sums, motion_z))
         return tuple(odds_by_balance)
 
     @property
     def shows_motion(self) -> bool:
         """True if flow and motion correlate by `sense.motion_score` (`priors.toml`) standard errors, either way."""
-        z_scores = [abs(flow_sign.compute_z_score(*sums)) for motions in self._motions for sums in motions]
+        z_scores = [abs(flow_sign.z_score(*sums)) for motions in self._motions for sums in motions.tolist()]
         return not z_scores or max(z_scores) > flow_sign.MOTION_SCORE
 
 
@@ -494,4 +495,4 @@ def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
         float(gram[roles.leak, roles.leak]),
     )
     freedom = float(n_rows - len(nuisance) - 1)
-    return float(flow_sign.compute_leak_score(energy, moment, leak.square, whole_energy, freedom))
+    return flow_sign.leak_score(energy, moment, leak.square, whole_energy, freedom)

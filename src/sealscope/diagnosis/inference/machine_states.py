@@ -125,8 +125,7 @@ def find_rests(
     is_slow = np.empty(len(increments) - window + 1, dtype=bool)
     sums = np.zeros(window + 1)
     _flag_slow_windows(np.asarray(increments, dtype=float), sums, limit * window / rate, is_slow)
-    is_rest_start = np.empty(len(increments) - min_length + 1, dtype=bool)
-    _flag_runs(extend_flags(is_slow, window), min_length, is_rest_start)
+    is_rest_start = _count_flags(extend_flags(is_slow, window), min_length)[min_length - 1 :] == min_length
     return extend_flags(is_rest_start, min_length)
 
 
@@ -323,20 +322,14 @@ def _window_sums(values: NDArray[Any], length: int) -> NDArray[Any]:
 
 def extend_flags(starts: NDArray[np.bool_], length: int) -> NDArray[np.bool_]:
     """Flag each flagged sample of `starts` (n,) and the next `length` - 1 samples, shape (n + length - 1,)."""
-    flags = np.empty(len(starts) + length - 1, dtype=bool)
-    _extend_flags(np.ascontiguousarray(starts), length, flags)
-    return flags
+    return _count_flags(np.append(starts, np.zeros(length - 1, dtype=bool)), length) > 0
 
 
-@kernel
-def _extend_flags(starts: Any, length: int, flags: Any) -> None:
-    """Write the flags of `extend_flags`."""
-    left = 0  # number of further samples to flag
-    for i in range(len(flags)):
-        if i < len(starts) and starts[i]:
-            left = length
-        flags[i] = left > 0
-        left -= 1
+def _count_flags(flags: NDArray[np.bool_], length: int) -> NDArray[np.int32]:
+    """Count the flagged samples among each sample and the `length` - 1 before it, shape (n,)."""
+    counts = np.cumsum(flags, dtype=np.int32)
+    counts[length:] -= counts[:-length].copy()
+    return counts
 
 
 @kernel
@@ -359,13 +352,3 @@ def _flag_slow_windows(increments: Any, sums: Any, limit: float, is_slow: Any) -
             before = place + 1 if place < window else 0
             is_slow[first] = n_missing == 0 and abs(total - sums[before]) <= limit
             n_missing -= 0 if np.isfinite(increments[first]) else 1
-
-
-@kernel
-def _flag_runs(flags: Any, length: int, is_start: Any) -> None:
-    """Flag the samples from which on `length` successive samples are flagged."""
-    run = 0
-    for i in range(len(flags)):
-        run = run + 1 if flags[i] else 0
-        if i >= length - 1:
-            is_start[i - length + 1] = run >= length

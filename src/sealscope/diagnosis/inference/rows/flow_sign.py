@@ -126,21 +126,3 @@ def sum_log_odds(leak_z: float, difference_sums: Any, force_sums: Any, motion_z:
     if motion_z > 0.0:  # else either the position or the flow may be reversed
         log_odds += sign_log_odds(motion_z, OTHER_MOTION)
     return log_odds
-
-
-@kernel
-def compute_log_odds(leak_z: float, load_sums: Any, motion_z: float) -> float:
-    """Compute the log odds that a flow has the right sign; `load_sums` (2, 7): of p_A - p_B and of the force."""
-    return sum_log_odds(leak_z, load_sums[0], load_sums[1], motion_z)  # type: ignore[no-any-return]
-
-
-@kernel
-def compute_z_score(total: float, square: float) -> float:
-    """Compute the z score of a sum of products (`z_score`)."""
-    return z_score(total, square)  # type: ignore[no-any-return]
-
-
-@kernel
-def compute_leak_score(energy: float, moment: float, square: float, whole_energy: float, freedom: float) -> float:
-    """Compute the z score of the leak's coefficient (`leak_score`)."""
-    return leak_score(energy, moment, square, whole_energy, freedom)  # type: ignore[no-any-return]
