@@ -141,18 +141,8 @@ _PASSES = (
 )
 
 
-class _Library(JITCodeLibrary):  # type: ignore[misc]
-    """Compiled code of a function and of those that it calls, optimised once, as a whole."""
-
-    def _optimize_functions(self, module: Any) -> None:
-        """Leave out the passes over single functions: those over the whole library, which follow, repeat them."""
-        module.data_layout = self._codegen._data_layout
-
-
 class _ShortCompiler(CompilerBase):  # type: ignore[misc]
-    """numba's compiler with only the passes in `_PASSES`; its result is machine code in a `library`."""
-
-    library = _Library
+    """numba's compiler with only the passes in `_PASSES`."""
 
     def compile_extra(self, function: Any) -> Any:
         """Compile a function, and the laws it calls, without collections of garbage, which take a tenth of the time.
@@ -169,8 +159,6 @@ class _ShortCompiler(CompilerBase):  # type: ignore[misc]
 
     def define_pipelines(self) -> list[Any]:
         """Build a list with one pipeline of numba, which has the passes in `_PASSES`."""
-        self.state.library = self.library(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
-        self.state.library.enable_object_caching()
         pipeline = PassManager("nopython")
         for step in _PASSES:
             pipeline.add_pass(step, step.__name__)
@@ -210,12 +198,19 @@ def compile_kernel(function: Callable[..., Any], folder: Path | None) -> Any:
     return _dispatcher(function, {"no_cfunc_wrapper": True}, folder)
 
 
-class _LawLibrary(_Library):
+class _LawLibrary(JITCodeLibrary):  # type: ignore[misc]
     """Compiled code of a function that only other compiled functions call, without machine code of its own.
 
     The code is linked into these functions as LLVM code. It is optimised here once, not in each function that calls it,
     so that all of them compute identical results.
     """
+
+    def _optimize_functions(self, module: Any) -> None:
+        """Leave out the passes over single functions: those over the whole library, which follow, repeat them.
+
+        Kernels keep them: without, single-precision sums of contracted laws are rounded otherwise.
+        """
+        module.data_layout = self._codegen._data_layout
 
     def _finalize_final_module(self) -> None:
         """Mark the library as final without generating machine code, which numba would do here."""
@@ -225,11 +220,10 @@ class _LawLibrary(_Library):
 class _LawCompiler(_ShortCompiler):
     """Compiler of laws, the functions for other compiled functions; its result is LLVM code in a `_LawLibrary`."""
 
-    library = _LawLibrary
-
     def define_pipelines(self) -> list[Any]:
         """Build a list with one pipeline of numba, with the passes in `_PASSES` but without machine code."""
         self.state.flags.no_compile = True
+        self.state.library = _LawLibrary(self.state.targetctx.codegen(), self.state.func_id.func_qualname)
         return super().define_pipelines()
 
 

@@ -34,7 +34,7 @@ ATTRIBUTES = {
         *("save_overload", "flush", "cache_path"),
     ),
     "numba.core.codegen:JITCodeLibrary": (
-        *("_finalize_final_module", "_optimize_functions", "enable_object_caching", "get_pointer_to_function"),
+        *("_finalize_final_module", "_optimize_functions", "get_pointer_to_function"),
     ),
     "numba.core.compiler:CompilerBase": ("compile_extra", "define_pipelines"),
     "numba.core.compiler_machinery:PassManager": ("add_pass", "finalize"),
