@@ -21,7 +21,8 @@ def test_a_leak_as_planned_is_shown_as_often_as_planned():
         random = np.random.default_rng(seed)
         t = np.arange(0.0, 60.0 * planned.minutes, 1.0)
         values = {"x": 0.4 - planned.creep * t + NOISE * random.standard_normal(t.size), "T_oil": 320.0 + 0.0 * t}
-        recording = ss.Recording(t, values, {"x": "m", "T_oil": "K"}, rate=1.0)
+        values["p_A"] = 8e6 + 1e4 * random.standard_normal(t.size)
+        recording = ss.Recording(t, values, {"x": "m", "p_A": "Pa", "T_oil": "K"}, rate=1.0)
         (result,) = ss.hold_test(recording, area=AREA)
         shown += result.leak_interval_lpm[0] > 0.0
     assert 15 <= shown <= 30

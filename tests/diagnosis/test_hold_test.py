@@ -155,6 +155,35 @@ def test_the_load_is_on_the_side_of_the_greater_force():
     assert result.creep_mm_per_min == pytest.approx(0.5, rel=0.05)
 
 
+def test_a_chamber_that_its_leak_empties_carries_the_load():
+    t, random = np.arange(0.0, 600.0, 0.1), np.random.default_rng(4)
+    channels = {"p_A": 4.4e6 * np.exp(-t / 60.0), "p_B": 2.5e5 + 0.0 * t}
+    channels = {name: p + 1e4 * random.standard_normal(t.size) for name, p in channels.items()}
+    recording = ss.Recording(t, channels, dict.fromkeys(channels, "Pa"), rate=10.0)
+    (result,) = ss.hold_test(recording, area=AREAS, volume=("1 L", "1 L"), oil="40 degC steady")
+    oil_lpm = 1e-3 * 8e-10 * 4.4e6 / 600.0 * 6e4  # that of the oil; its air adds to it
+    assert 0.5 * oil_lpm < result.leak_interval_lpm[0] < result.leak_lpm < 3.0 * oil_lpm
+
+
+def test_a_rest_without_a_load_is_a_note():
+    t, random = np.arange(0.0, 200.0, 0.1), np.random.default_rng(6)
+    x = 0.4 - 0.05 * np.clip(t - 100.0, 0.0, 1.0) + 1e-5 * random.standard_normal(t.size)
+    p_A = np.where(t < 100.5, 8e6, 1e5) + 1e4 * random.standard_normal(t.size)
+    recording = ss.Recording(t, {"x": x, "p_A": p_A, "p_B": tank(t)}, {"x": "m", "p_A": "Pa", "p_B": "Pa"}, rate=10.0)
+    (result,) = ss.hold_test(recording, area=AREAS)
+    assert result.end_s == pytest.approx(100.0, abs=2.0)
+    assert [finding.code for finding in result.quality] == ["unloaded_rest"]
+
+
+def test_a_position_alone_does_not_tell_what_the_load_compresses():
+    recording = record_hold(0.5, log_T=True)
+    widths = []
+    for log in (recording, recording.only(["x", "T_oil"])):
+        (result,) = ss.hold_test(log, area=AREAS, loaded="A")
+        widths.append(float(np.ptp(result.leak_interval_lpm)))
+    assert widths[1] > 3.0 * widths[0]
+
+
 def test_a_side_at_vacuum_is_read_by_its_means():
     for seed, low in enumerate((-1e5, -0.8e5, 0.0)):
         random = np.random.default_rng(seed)
@@ -319,8 +348,11 @@ def test_a_recording_of_a_held_load_is_judged_by_the_hold_test():
     assert hold.result == "fail" and hold.reason in diagnosis.reason
     assert diagnosis.total_leakage.lpm == pytest.approx(0.5e-3 * 3.117, rel=0.02)
     assert diagnosis.as_dict()["holds"] == [hold.as_dict()]
+    pressures = record_hold(minutes=5.0, p_A=lambda t: 2e7 * np.exp(-t / 2000.0), p_B=tank).only(["p_A", "p_B"])
+    assert len(ss.diagnose(pressures, rig=RIG).holds) == 1
     moving = ss.simulate(command="3 sin(4t)", duration="20 s", seed=1)
-    assert ss.diagnose(moving).holds == ()
+    for log in (moving, moving.only(["p_A", "p_B"])):
+        assert ss.diagnose(log).holds == ()
 
 
 def test_tests_in_order_of_time_are_a_trend(tmp_path):

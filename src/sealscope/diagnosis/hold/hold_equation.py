@@ -25,7 +25,6 @@ import numpy as np
 from sealscope.diagnosis.estimate.interval import WITHIN_95
 from sealscope.diagnosis.estimate.population import Mixture, pool_mixtures
 from sealscope.diagnosis.hold.readings import (
-    N_PARTS,
     Readings,
     average_parts,
     course_basis,
@@ -44,11 +43,10 @@ from sealscope.diagnosis.hold.regression import (
 from sealscope.diagnosis.hold.result import HoldCurve
 from sealscope.diagnosis.hold.set_up import SetUp
 from sealscope.diagnosis.inference.circuit.holds.hold_oil import relative_compression
-from sealscope.diagnosis.inference.circuit.holds.recorded_hold import estimate_hold_offsets, small_difference_factor
 from sealscope.diagnosis.inference.hypotheses import LAWS
 from sealscope.diagnosis.priors.hold import HOLD
 from sealscope.diagnosis.priors.inference import INFERENCE
-from sealscope.recordings.channels import chambers_of
+from sealscope.recordings.channels import chambers_of, estimate_quantum
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Array, Recording
 from sealscope.units import BAR, ML_PER_MINUTE, MM_PER_MINUTE, P_ATM
@@ -57,26 +55,21 @@ from sealscope.units import BAR, ML_PER_MINUTE, MM_PER_MINUTE, P_ATM
 LOWEST = 2e4
 #: Ratio of the highest to the lowest pressure difference of a hold, above which the law of the leak counts.
 STEADY_PRESSURE = 1.02
-#: Start of the last part of a hold, over its duration, and the smallest difference of pressures that it resolves, in
-#: standard deviations of the noise of parts.
-LAST_PART, RESOLVED = 0.97, 4.0
-#: Least noise [Pa] of a difference of pressures, which rounding may hide.
-LEAST_NOISE = 1.0
+#: Start of the last part of a hold, over its duration.
+LAST_PART = 0.97
 #: Degree of the polynomial that smooths a logged temperature.
 SMOOTH_DEGREE = 3
-#: Time constants [durations of the hold] of the exponentials that such a smooth course has as well, and the number of
-#: its passages from step to step, or of its means, that are needed for them.
-COURSE_TIMES, MIN_PASSAGES = (0.2,), 24
+#: Time constants [durations of the hold] of the exponentials that such a smooth course has as well.
+COURSE_TIMES = (0.06, 0.2)
 #: Time [s] by which a logged temperature is moved to find its slope.
 DELAY = 1.0
-#: Number of time constants of what settles that are tried, to find the best.
-N_TIMES = 30
 #: Least driving pressure from which a flow is converted, in deviations of the zero of the sensors.
 LEAST_DRIVE = 0.2
-#: Factor by which the travel equivalent to a pressure's fall exceeds a piston's travel, where that is at a stop.
-AT_STOP = 3.0
-#: Error of the change of a rounded temperature over a hold, in steps.
-ROUNDED = 0.15
+#: Factor by which the travel equivalent to a pressure's change exceeds a piston's travel, where that is at a stop: of a
+#: travel that may be none, and of one that the noise does not explain.
+AT_STOP, SURELY_AT_STOP = 3.0, 30.0
+#: Error of a rounded temperature at a passage, and of its change over a hold without passages, in steps.
+PASSED, ROUNDED = 0.15, 0.4
 #: Standard deviation of the logarithm of a time constant within a step of its grid, and a step of a derivative by it.
 GRID_DEVIATION, SLIGHTLY = 0.3, 1.05
 #: Least bend of a travel [mm] that is fitted.
@@ -88,14 +81,14 @@ _MM = 1e3
 class LeakClock(NamedTuple):
     """Time weighted by the flow of a leak under one law: prior `weight`, `minutes` (m,) of mean `flow` (m,) 1.
 
-    `spare` (m,): how much of it is due to the sensors' offset in a hold whose pressures a leak has equalised;
+    `zero` (m,): its change by a standard deviation of the sensors' zeros, None for a steady flow;
     `conversions`: probability, factor to the flow at the reference pressure, and deviation of its logarithm.
     """
 
     weight: float
     minutes: Array
     flow: Array
-    spare: Array | None = None
+    zero: Array | None = None
     conversions: tuple[tuple[float, float, float], ...] = ()
 
     def convert(self, rate: Mixture) -> Mixture | None:
@@ -125,40 +118,23 @@ def _compress_oil(p: Array) -> Array:
     return relative_compression(np.maximum(p, LOWEST))
 
 
-def _exponential(
-    readings: Readings, time: float, size: float, mean: float = 0.0, span: float = math.inf
-) -> tuple[Column, Column]:
+def _compress_zero(p: Array) -> Array:
+    """Compute the error of the relative compression at pressures `p` (n,) [Pa] by the zero of a sensor, from its start.
+
+    Near a vacuum the air makes it large.
+    """
+    low, high = (_compress_oil(p + side * HOLD.other.offset * BAR).sum(axis=0) for side in (-0.5, 0.5))
+    return np.asarray(high - low - (high[0] - low[0]))
+
+
+def _exponential(readings: Readings, time: float, size: float, mean: float = 0.0) -> tuple[Column, Column]:
     """Build the columns of an exponential with an amplitude of the given `mean` and deviation `size`.
 
     The second column is its derivative by the logarithm of the time constant, which the grid of these leaves open.
-    `span`: duration [s] of a hold without mean speed, by the chord of each column; infinite to leave it.
     """
-
-    def course(ratio: float) -> Array:
-        """Compute the exponential of `ratio` times the time constant."""
-        chord = math.expm1(-span / (ratio * time)) / span if math.isfinite(span) else 0.0
-        return readings.decay(ratio * time) - 1.0 - chord * readings.t
-
-    slope = (course(SLIGHTLY) - course(1.0 / SLIGHTLY)) / (2.0 * math.log(SLIGHTLY))
-    return Column(course(1.0), mean, size), Column(slope, 0.0, math.hypot(size, mean) * GRID_DEVIATION)
-
-
-def _refine_times(readings: Readings, times: Sequence[float]) -> list[float]:
-    """Replace the nearest of some time constants [s] by that of the exponential that fits the readings best.
-
-    The rest of the readings is a polynomial meanwhile. Passages between the steps of an encoder are too few for it.
-    """
-    if readings.quantum or not times or len(readings.t) < MIN_PASSAGES:
-        return list(times)
-    tried = np.geomspace(times[0], times[-1], N_TIMES)
-    basis = np.linalg.qr(course_basis(readings.t / readings.t[-1], SMOOTH_DEGREE))[0]
-    rest = readings.values - basis @ (basis.T @ readings.values)
-    courses = np.array([readings.decay(time) for time in tried])
-    courses -= (courses @ basis) @ basis.T
-    explained = (courses @ rest) ** 2 / np.maximum((courses**2).sum(axis=1), np.finfo(float).tiny)
-    best = float(tried[int(explained.argmax())])
-    nearest = int(np.abs(np.log(np.array(times) / best)).argmin())
-    return [*times[:nearest], best, *times[nearest + 1 :]]
+    slope = (readings.decay(SLIGHTLY * time) - readings.decay(time / SLIGHTLY)) / (2.0 * math.log(SLIGHTLY))
+    course = Column(readings.decay(time) - 1.0, mean, size)
+    return course, Column(slope, 0.0, math.hypot(size, mean) * GRID_DEVIATION)
 
 
 class HeldLoad:
@@ -189,8 +165,10 @@ class HeldLoad:
         pressures = (
             {} if self.recording is None else {name[-1]: self.recording[name] for name in chambers_of(self.recording)}
         )
-        if pressures:  # by force where the areas are known
-            return max(pressures, key=lambda side: float(np.median(pressures[side])) * (self.set_up.area(side) or 1.0))
+        if pressures:  # by force at the start, where the areas are known
+            begin = self.t <= (1.0 - LAST_PART) * self.duration
+            forces = {side: float(p[begin].mean()) * (self.set_up.area(side) or 1.0) for side, p in pressures.items()}
+            return max(forces, key=lambda side: forces[side])
         x = self._channel("x")
         return "B" if x is not None and self._slope_of(x) > 0.0 else "A"
 
@@ -231,68 +209,81 @@ class HeldLoad:
         return None if p is None else float(np.mean(p))
 
     def _settling(self, readings: Readings, sizes: Sequence[float]) -> list[Alternative]:
-        """List what may settle in `readings` after the valve has shut; `sizes`: deviations of its amplitude.
-
-        Without a pressure, a leak that falls off bends the readings, too, which takes nothing of its mean.
-        """
+        """List what may settle in `readings` after the valve has shut; `sizes`: deviations of its amplitude."""
         prior = HOLD.settling
-        times = _refine_times(readings, [time for time in prior.times if time <= prior.longest * self.duration])
+        times = [time for time in prior.times if time <= prior.longest * self.duration]
         weight = prior.present / max(len(times) * len(sizes), 1)
         terms = [_exponential(readings, time, size) for time in times for size in sizes]
-        settling = [Alternative(1.0 - prior.present), *(Alternative(weight, term) for term in terms)]
-        if self.mean_pressure is not None:
-            return settling
-        share, size = HOLD.other.locked / len(prior.emptying), max(float(np.ptp(readings.values)), LEAST_BEND)
-        bends = [_exponential(readings, time * self.duration, size, span=self.duration) for time in prior.emptying]
-        held = [entry._replace(weight=(1.0 - HOLD.other.locked) * entry.weight) for entry in settling]
-        return held + [Alternative(share, bend) for bend in bends]
+        return [Alternative(1.0 - prior.present), *(Alternative(weight, term) for term in terms)]
 
-    def _thermal_columns(self, t: Array) -> list[Column]:
-        """Build the columns [mm] of a logged temperature at times `t`; none without a log."""
+    def _strain_sizes(self, length: float) -> list[float]:
+        """Compute the deviations of what settles of a column of a `length`, within what a pressure may settle by."""
+        p = self.mean_pressure
+        largest = math.inf if p is None else HOLD.part.fall * INFERENCE.held_oil.compressibility * p
+        return [length * min(strain, largest) for strain in HOLD.settling.strain]
+
+    def _bends(self, readings: Readings) -> list[Alternative]:
+        """List slow changes of the speed of `readings` about its mean, by a load, a leak or oil that changes.
+
+        Their courses vanish at both ends of the hold: exponentials without their chords, and polynomials.
+        """
+        prior, span = HOLD.bend, self.duration
+        z = readings.t / span
+        courses = [readings.decay(time * span) - 1.0 - z * math.expm1(-1.0 / time) for time in prior.times]
+        courses += [z * (1.0 - z), z * (1.0 - z) * (1.0 - 2.0 * z)]
+        courses = [course / (float(np.abs(course).max()) or 1.0) for course in courses]
+        travel, weight = max(float(np.ptp(readings.values)), LEAST_BEND), prior.present / len(prior.sizes)
+        bends = [tuple(Column(course, 0.0, size * travel) for course in courses) for size in prior.sizes]
+        return [Alternative(1.0 - prior.present), *(Alternative(weight, columns) for columns in bends)]
+
+    @cached_property
+    def logged_temperature(self) -> Readings | None:
+        """Readings of the oil's temperature; None if less than half of it was logged."""
         T = self._channel("T_oil")
         if T is None or np.isfinite(T).mean() < 0.5:
-            return []
-        logged = read_channel(self.t[np.isfinite(T)], T[np.isfinite(T)], HOLD.cooling.step)
-        weights = 1.0 / np.hypot(logged.loose, max(logged.quantum, 1e-3))
-        n_exact = int(np.count_nonzero(logged.loose == 0.0))
-        degree = max(min(SMOOTH_DEGREE, n_exact - 1), 1)
-        times = COURSE_TIMES if n_exact >= MIN_PASSAGES else ()
-        basis = weights[:, None] * course_basis(logged.t / self.duration, degree, times)
-        coefficients = np.linalg.lstsq(basis, weights * logged.values, rcond=None)[0]
-        residual = (logged.values - basis @ coefficients / weights)[logged.loose == 0.0]
-        error = float(np.sqrt(np.mean(residual**2) * basis.shape[1] / max(len(residual), 1))) if n_exact else 0.0
-        length, deviation = self.column
-        scale = -HOLD.cooling.expansion * length
-        change = course_basis(t / self.duration, degree, times) - course_basis(np.zeros(1), degree, times)
-        travel = scale * np.asarray(change @ coefficients)
-        later = (
-            course_basis((t + DELAY) / self.duration, degree, times) - change - course_basis(np.zeros(1), degree, times)
-        )
-        delayed = scale * np.asarray(later @ coefficients) / DELAY  # [mm/s]
-        uncertainty = math.hypot(deviation, HOLD.cooling.expansion_deviation)
-        unread = scale * math.hypot(0.5 * ROUNDED * logged.quantum, error)
-        size = math.hypot(HOLD.cooling.misfit * float(np.ptp(travel)), unread)
-        misfit = [Column(np.exp(-t / (time * self.duration)), 0.0, size) for time in times]
-        lag = Column(delayed, *HOLD.cooling.lag)
-        return [Column(travel, 1.0, uncertainty), lag, *self._misfit(t, t, size), *misfit]
+            return None
+        return read_channel(self.t[np.isfinite(T)], T[np.isfinite(T)], HOLD.cooling.step)
 
-    def _misfit(self, t: Array, course: Array, size: float) -> list[Column]:
-        """Build the slope, of a standard deviation `size` [mm], and bends that a correction leaves at times `t` [s].
+    def _thermal_columns(self, t: Array, length: float, deviation: float) -> list[Column]:
+        """Build the columns [mm] of a logged temperature at times `t`, for a column of oil of a `length`; or none.
 
-        `course` (m,): what the correction depends on, such as a pressure or the time; the bends are polynomials of it.
+        They are its effect, known to a relative `deviation` beside that of the oil's expansion, that of the
+        thermometer's delay, and a line for what the log does not tell of the change.
         """
-        z = 2.0 * (course - course.min()) / (float(np.ptp(course)) or 1.0) - 1.0
-        courses = 2.0 * t / self.duration - 1.0, 1.5 * z**2 - 0.5, 2.5 * z**3 - 1.5 * z  # Legendre polynomials
-        return [Column(values, 0.0, size) for values in courses]
+        T, logged, prior = self._channel("T_oil"), self.logged_temperature, HOLD.cooling
+        if T is None or logged is None:
+            return []
+        errors = np.hypot(logged.loose, max(PASSED * logged.quantum, 1e-3))
+        times = np.concatenate([t, t + DELAY, [0.0, self.duration], logged.t]) / self.duration
+        basis = course_basis(times, SMOOTH_DEGREE, COURSE_TIMES)
+        now, later, ends, read = np.split(basis, np.cumsum([len(t), len(t), 2]))
+        weighted = read / errors[:, None]
+        ridge = np.diag([0.0, *np.full(basis.shape[1] - 1, max(prior.sizes) ** -2.0)])
+        covariance = np.linalg.inv(weighted.T @ weighted + ridge)
+        middle = float(logged.values.mean())
+        coefficients = covariance @ (weighted.T @ ((logged.values - middle) / errors))
+        residual = (logged.values - middle - read @ coefficients) / errors
+        change = ends[1] - ends[0]
+        error = math.sqrt(float(change @ covariance @ change) * max(float(np.mean(residual**2)), 1.0))
+        if not logged.quantum:  # means of rounded values
+            error = math.hypot(error, ROUNDED * estimate_quantum(T))
+        scale = -prior.expansion * length
+        travel, delayed = scale * ((now - ends[0]) @ coefficients), scale * ((later - now) @ coefficients) / DELAY
+        unread = math.hypot(scale * error, prior.misfit * float(np.ptp(travel)))
+        return [
+            Column(travel, 1.0, math.hypot(deviation, prior.expansion_deviation)),
+            Column(delayed, *prior.lag),
+            Column(t / self.duration, 0.0, unread),
+        ]
 
-    def _cooling(self, readings: Readings, span: float = math.inf) -> list[Alternative]:
-        """List the alternatives for the travel [mm] due to the oil's temperature in `readings`.
+    def _cooling(self, readings: Readings, length: float, deviation: float) -> list[Alternative]:
+        """List the alternatives for the travel [mm] due to the oil's temperature in `readings` (`_thermal_columns`).
 
-        `span`: as of `_exponential`, for oil that nobody logs. Where no pressure is logged, the other side may be
-        locked: the travel by a logged temperature then has either sign.
+        Where no pressure is logged, the other side may be locked: the travel by a logged temperature then has either
+        sign.
         """
         prior, set_up = HOLD.cooling, self.set_up
-        if logged := self._thermal_columns(readings.t):
+        if logged := self._thermal_columns(readings.t, length, deviation):
             if self.travel is None or self.mean_pressure is not None:
                 return [Alternative(1.0, tuple(logged))]
             locked = logged[0]._replace(mean=0.0, deviation=1.0), *logged[1:]
@@ -306,19 +297,23 @@ class HeldLoad:
                 excess = max(set_up.oil_temperature - prior.ambient, min(prior.sizes))
             mean, deviation = prior.stated
             sizes = [((1.0 if set_up.oil_course == "falling" else -1.0) * mean * excess, deviation * excess)]
-        factor = prior.expansion * self.column[0]
+        factor = prior.expansion * length
         weight = 1.0 / (len(sizes) * len(prior.times))
-        terms = [
-            _exponential(readings, time, factor * d, -factor * mean, span) for time in prior.times for mean, d in sizes
-        ]
+        terms = [_exponential(readings, time, factor * d, -factor * mean) for time in prior.times for mean, d in sizes]
         return [Alternative(weight, term) for term in terms]
 
     @property
     def warming(self) -> float:
         """Standard deviation [K] of a change of the oil's temperature that is neither logged nor stated to be small."""
-        if self._thermal_columns(self.t[:1]):
+        if self.logged_temperature is not None:
             return 0.0
         return HOLD.cooling.steady if self.set_up.oil_course == "steady" else max(HOLD.cooling.sizes)
+
+    @property
+    def thermal_error(self) -> float:
+        """Standard deviation [mm] of the travel over the hold by what a logged temperature does not tell."""
+        logged = self._thermal_columns(self.t, *self.column)
+        return logged[-1].deviation if logged else 0.0
 
     def _clocks(self, readings: Readings) -> list[LeakClock]:
         """List the clocks of the laws of a leak, as `readings` see them."""
@@ -327,30 +322,32 @@ class HeldLoad:
         if p is None:
             return [steady]
         # past the piston, or out of the cylinder
-        differences = [p - P_ATM] if other is None else [p - other, p - P_ATM]
+        differences = [self._implied_difference(p) if other is None else p - other, p - P_ATM]
         courses = [smooth_course(self.t, difference) for difference in differences]
         if all(course.max() < STEADY_PRESSURE * course.min() for _, course in courses):
-            conversions = [self._convert(course, *law) for _, course in courses for law in LAWS.items()]
-            return [steady._replace(conversions=tuple(filter(None, conversions)))]
+            steadily = [self._convert(course, *law) for _, course in courses for law in LAWS.items()]
+            return [steady._replace(conversions=tuple(filter(None, steadily)))]
         clocks = []
-        for k, (part_t, course) in enumerate(courses):
-            driving = course
-            if k == 0 and other is not None:
-                # what is left of the difference after a leak has equalised the pressures is an error of the sensors
-                last = self.t >= self.duration * LAST_PART
-                offset, _, is_equalised = estimate_hold_offsets(float(p[last].mean()), float(other[last].mean()), 0.0)
-                if is_equalised:
-                    noise = float(np.std(p[last] - other[last])) / math.sqrt(max(len(p) / N_PARTS, 1.0))
-                    driving = (course - offset) * small_difference_factor(
-                        course - offset, RESOLVED * noise + LEAST_NOISE
-                    )
+        for part_t, course in courses:
+            zero = math.hypot(HOLD.other.offset * BAR, INFERENCE.held_oil.gain * float(np.mean(p)))
             for exponent, weight in LAWS.items():
-                minutes, flow = self._weigh_time(readings, part_t, driving, exponent)
-                spare = minutes - self._weigh_time(readings, part_t, course, exponent)[0]
-                clock = LeakClock(weight / len(differences), minutes, flow, None if driving is course else spare)
-                conversion = self._convert(driving, exponent, 1.0)
-                clocks.append(clock._replace(conversions=(conversion,) if conversion else ()))
+                minutes, flow = self._weigh_time(readings, part_t, course, exponent)
+                high, low = (self._weigh_time(readings, part_t, course + d, exponent)[0] for d in (zero, -zero))
+                conversions = tuple(filter(None, [self._convert(course, exponent, 1.0)]))
+                clocks.append(LeakClock(weight / len(differences), minutes, flow, 0.5 * (high - low), conversions))
         return clocks
+
+    def _implied_difference(self, p: Array) -> Array:
+        """Estimate the difference (n,) of an absolute pressure `p` (n,) to that of a closed side that nobody logs.
+
+        Under a free piston the other side rises with the loaded one, by the ratio of their areas. At a stop a leak has
+        equalised the sides at the end.
+        """
+        area, other_area = self.set_up.area(self.loaded), self.set_up.area(self.unloaded)
+        if self.travel is None or self._is_at_stop or area is None or other_area is None:
+            return p - float(np.mean(p[self.t >= self.duration * LAST_PART]))
+        start = float(np.mean(p[self.t <= self.duration * (1.0 - LAST_PART)]))
+        return start - P_ATM - (area / other_area - 1.0) * (p - start)
 
     def _convert(self, driving: Array, exponent: float, weight: float) -> tuple[float, float, float] | None:
         """Convert a mean flow by the `driving` pressure (k,) to the reference (`LeakClock.conversions`), if any.
@@ -381,64 +378,38 @@ class HeldLoad:
         if self.travel is None:
             return None
         readings, stopped = self._travel_readings, HOLD.settling.stopped
-        t = readings.t
-        base = [Column(t / 60.0), Column(np.ones_like(t)), *self._pressure_bends()]
-        resting = [Alternative(stopped)]
-        if logged := self._thermal_columns(t):
-            thermal = [Alternative(1.0 - stopped, tuple(logged))]
-        elif self.set_up.oil_course:
-            thermal = [Alternative((1.0 - stopped) * weight, columns) for weight, columns in self._cooling(readings)]
-        else:
-            bends = self._cooling(readings, self.duration)
-            thermal = resting + [Alternative((1.0 - stopped) * weight, columns) for weight, columns in bends]
-            resting = []
-        settling = self._settling(readings, HOLD.settling.travel)
-        fits = [self._regression.fit_rate(base, [settling, terms]) for terms in (thermal, resting) if terms]
+        base = [Column(readings.t / 60.0), Column(np.ones_like(readings.t))]
+        thermal = self._cooling(readings, *self.column) if self.set_up.oil_course or self.logged_temperature else []
+        resting = [Alternative(stopped if thermal else 1.0)]  # a piston on its stop follows no temperature
+        thermal = [entry._replace(weight=(1.0 - stopped) * entry.weight) for entry in thermal]
+        alternatives = [self._settling(readings, self._strain_sizes(self.column[0])), self._bends(readings)]
+        fits = [self._regression.fit_rate(base, [*alternatives, terms]) for terms in (thermal, resting) if terms]
         logs = [fit.log_evidence for fit in fits]
-        if resting:  # a piston on its stop follows no temperature, and does not creep
+        if thermal:  # ... and does not creep
             logs[1] -= 0.5 * (fits[1].rate.mean / fits[1].rate.deviation) ** 2
         fit = pool_fits(fits, logs)
-        change = float(fit.fit[-1] - fit.fit[0]) * self.duration / float(t[-1] - t[0])
-        bend = float(np.ptp(self._bend(t, fit.fit, change)))
-        bent = HOLD.cooling.misfit * bend / (self.duration / 60.0)
-        return fit._replace(rate=fit.rate.add_error(bent))
+        bend = fit.fit - np.linspace(fit.fit[0], fit.fit[-1], len(fit.fit))
+        return fit._replace(rate=fit.rate.add_error(HOLD.cooling.misfit * float(np.ptp(bend)) / (self.duration / 60.0)))
 
-    def _pressure_bends(self) -> list[Column]:
-        """Build the bends [mm] of the travel by pressures that change: compression, and laws of a leak."""
-        readings = self._travel_readings
-        columns, clocks = self._compression_columns(is_bend=True), self._clocks(readings)
-        speed = float(np.ptp(readings.values)) / (self.duration / 60.0)
-        for k, clock in enumerate(clocks):
-            if len(clocks) > 1 and k % len(LAWS) != 1:  # the law between is nearly their mean
-                columns.append(Column(speed * self._bend(readings.t, clock.minutes, self.duration / 60.0), 0.0, 1.0))
-        return [column for column in columns if np.ptp(column.values) > LEAST_BEND]
+    def _column_terms(self) -> list[Column]:
+        """Build the columns of the travel [mm] by compression of the loaded side's oil and air, and by its length.
 
-    def _compression_columns(self, *, is_bend: bool = False) -> list[Column]:
-        """Build the columns of the travel [mm] by compression of the loaded side's oil and air, and what these leave.
-
-        `is_bend`: without the chords between their ends, which leaves no mean speed.
+        An error of the length changes these and the effect of a logged temperature in proportion.
         """
-        p = self._pressure(self.loaded)
-        if p is None:
+        p, readings, (length, deviation) = self._pressure(self.loaded), self._travel_readings, self.column
+        columns = self._thermal_columns(readings.t, length, 0.0)[:1]
+        if p is not None:
+            oil, (t, course) = INFERENCE.held_oil, smooth_course(self.t, p)
+            for compression, width in zip(_compress_oil(course), (oil.deviation, oil.air_deviation), strict=True):
+                travel = sample_course(readings, t, length * (compression - compression[0]))
+                columns.append(Column(travel, 1.0, width))
+        if not columns:
             return []
-        oil, readings, (length, deviation) = INFERENCE.held_oil, self._travel_readings, self.column
-        t, course = smooth_course(self.t, p)
-        columns = []
-        for compression, width in zip(_compress_oil(course), (oil.deviation, oil.air_deviation), strict=True):
-            travel = length * (compression - compression[0])
-            columns.append(Column(travel, 1.0, math.hypot(deviation, width)))
-            if np.ptp(travel) > LEAST_BEND:
-                columns += self._misfit(t, travel, oil.misfit * float(np.ptp(travel)))
-        if is_bend:
-            columns = [
-                entry._replace(values=self._bend(t, entry.values, float(entry.values[-1] - entry.values[0])))
-                for entry in columns
-            ]
-        return [entry._replace(values=sample_course(readings, t, entry.values)) for entry in columns]
-
-    def _bend(self, t: Array, course: Array, change: float) -> Array:
-        """Subtract from a `course` at times `t` [s] a line with its `change` over the hold: no mean speed is left."""
-        return np.asarray(course - change * t / self.duration)
+        scaled = Column(np.sum([entry.values for entry in columns], axis=0), 0.0, deviation)
+        if p is None:
+            return [scaled]
+        zero = Column(sample_course(readings, t, length * _compress_zero(course)), 0.0, 1.0)
+        return [*columns[-2:], zero, scaled]
 
     @cached_property
     def _travel_readings(self) -> Readings:
@@ -460,10 +431,8 @@ class HeldLoad:
         slope = length * float(np.diff(_compress_oil(middle).sum(axis=0))[0]) / BAR
         compression = length * _compress_oil(readings.values).sum(axis=0)
         travel = readings._replace(values=compression, loose=slope * readings.loose, quantum=slope * readings.quantum)
-        size = INFERENCE.held_oil.misfit * float(np.ptp(compression))
-        course = sample_course(readings, *smooth_course(self.t, p))
-        misfit = self._misfit(readings.t, course, size) if size > LEAST_BEND else []
-        return readings, travel, [Column(np.ones_like(readings.t)), *misfit]
+        zero = Column(length * _compress_zero(readings.values), 0.0, 1.0)
+        return readings, travel, [Column(np.ones_like(readings.t)), zero]
 
     @cached_property
     def gain(self) -> Mixture | None:
@@ -473,18 +442,18 @@ class HeldLoad:
             return None
         length, deviation = self.set_up.column(self.unloaded, None)
         _, compression, base = self._read_compression(p, _MM * length)
-        t = compression.t
         # oil that cools in a closed chamber loses pressure; a side that is open to the tank follows no temperature
-        logged = [column._replace(values=-column.values) for column in self._thermal_columns(t)]
-        closed = [Alternative(1.0, tuple(logged))] if logged else self._cooling(compression)
+        width = INFERENCE.held_oil.deviation
+        closed = [
+            Alternative(entry.weight, tuple(column._replace(values=-column.values) for column in entry.columns))
+            for entry in self._cooling(compression, _MM * length, width)
+        ]
         thermal = [Alternative(0.5), *(Alternative(0.5 * weight, columns) for weight, columns in closed)]
-        sizes = [_MM * length * strain for strain in HOLD.settling.strain]
-        alternatives = [self._settling(compression, sizes), thermal]
+        settling = self._settling(compression, self._strain_sizes(_MM * length))
+        alternatives = [settling, self._bends(compression), thermal]
         clocks = [clock._replace(conversions=()) for clock in self._clocks(compression)[: len(LAWS)]]
-        if len(clocks) > 1:  # a steady gain, too, whatever its law
-            clocks.append(LeakClock(clocks[0].weight, t / 60.0, np.ones_like(t)))
         fit = self._fit_laws(RateRegression(compression, self.duration), base, alternatives, clocks)
-        return fit.rate.scale(1.0, math.hypot(deviation, INFERENCE.held_oil.deviation))
+        return fit.rate.scale(1.0, math.hypot(deviation, width))
 
     @cached_property
     def leak(self) -> LeakEstimate:
@@ -503,15 +472,35 @@ class HeldLoad:
             )
             if leak.rate is None:
                 return leak
-            rates = leak.rate.multiply(leak_prior()), leak.converted and leak.converted.multiply(leak_prior())
+            rate = leak.rate.multiply(leak_prior())
             if area is None:
-                return leak._replace(rate=rates[0], converted=None)
-            flows = [rate and rate.scale(MM_PER_MINUTE * area) for rate in rates]
-            return leak._replace(rate=rates[0], flow=flows[0], converted=flows[1])
+                return leak._replace(rate=rate, converted=None)
+            scale = MM_PER_MINUTE * area
+            flow, *converted = (
+                self._widen(estimate).multiply(leak_prior()).scale(scale)
+                for estimate in (leak.rate, leak.converted)
+                if estimate is not None
+            )
+            return leak._replace(rate=rate, flow=flow, converted=converted[0] if converted else None)
         clocks = self._clocks(Readings(np.zeros(1), np.zeros(1), np.zeros(1), 0.0)) if self.t.size else []
-        converted = [entry for clock in clocks if (entry := clock.convert(flow)) is not None]
-        at_reference = pool_mixtures(converted, np.array([clock.weight for clock in clocks])) if converted else None
+        at_clocks = [entry for clock in clocks if (entry := clock.convert(flow)) is not None]
+        at_reference = pool_mixtures(at_clocks, np.array([clock.weight for clock in clocks])) if at_clocks else None
         return LeakEstimate(None if area is None else flow.scale(1.0 / (MM_PER_MINUTE * area)), flow, at_reference)
+
+    def _widen(self, rate: Mixture) -> Mixture:
+        """Add the errors by which a flow over the area differs from the `rate` [mm/min] of a piston.
+
+        They are those of area and position and, where no pressure is logged, of the oil that friction, a locked other
+        side or a sprung load compress.
+        """
+        prior = HOLD.load
+        free = rate.scale(1.0, prior.gauge).condense()
+        if self.mean_pressure is not None:
+            return free
+        per_bar = INFERENCE.held_oil.compressibility * BAR * self.column[0] / (self.duration / 60.0)
+        free = free.add_error(prior.friction * per_bar)
+        held = rate.scale(1.0, prior.stiffness).add_error(prior.change * per_bar)
+        return pool_mixtures([free, held], np.array([1.0 - HOLD.other.locked, HOLD.other.locked])).condense()
 
     def _metered_flow(self, meter: Array) -> Mixture:
         """Estimate the mean flow [m^3/s] of a leakage flow meter, whose gain is uncertain, under each law of a leak."""
@@ -530,8 +519,8 @@ class HeldLoad:
     def _leak_by_travel(self) -> LeakEstimate:
         """Estimate the leak from the travel, corrected for the compression of the loaded chamber's oil."""
         readings = self._travel_readings
-        base = [Column(np.ones_like(readings.t)), *self._compression_columns()]
-        fit = self._fit_leak(self._regression, base, HOLD.settling.travel)
+        base = [Column(np.ones_like(readings.t)), *self._column_terms()]
+        fit = self._fit_leak(self._regression, base, 0.0)
         return LeakEstimate(fit.rate, None, fit.converted, self._make_curve("x", "mm", readings, fit, 1.0), fit)
 
     def _leak_by_pressure(self) -> LeakEstimate:
@@ -541,10 +530,11 @@ class HeldLoad:
             return LeakEstimate(None, None)
         length, deviation = self.column
         pressures, compression, base = self._read_compression(p, -length)
-        sizes = [length * strain for strain in HOLD.settling.strain]
-        fit = self._fit_leak(RateRegression(compression, self.duration), base, sizes)
+        fit = self._fit_leak(RateRegression(compression, self.duration), base, INFERENCE.held_oil.deviation)
         width = math.hypot(deviation, INFERENCE.held_oil.deviation)
-        rate, converted = fit.rate.scale(1.0, width), fit.converted and fit.converted.scale(1.0, width)
+        rate, converted = fit.rate.scale(1.0, width).condense(), fit.converted
+        if converted is not None:
+            converted = converted.scale(1.0, width).condense()
         if self.creep is not None:
             rate = rate.add_error(self.creep.rate.deviation)
         # the fit is drawn as a pressure, by the slope of the compression over the hold
@@ -562,7 +552,8 @@ class HeldLoad:
         _, compression = average_parts(self.t, _compress_oil(p).sum(axis=0), 10)
         low, high = self.creep.rate.interval
         travel = abs(self.creep.rate.mean) * self.duration / 60.0
-        return low <= 0.0 <= high and float(np.ptp(compression)) * self.column[0] > AT_STOP * travel
+        factor = AT_STOP if low <= 0.0 <= high else SURELY_AT_STOP
+        return float(np.ptp(compression)) * self.column[0] > factor * travel
 
     def _fit_laws(
         self,
@@ -572,28 +563,28 @@ class HeldLoad:
         clocks: Sequence[LeakClock],
     ) -> RateFit:
         """Fit the rate [mm/min] under each law of a leak (`clocks`), and pool the laws."""
-        t = regression.readings.t
         fits, logs = [], []
         speed = float(np.ptp(regression.readings.values)) / (self.duration / 60.0)
         for clock in clocks:
-            law = [] if clock.spare is None else [Column(speed * clock.spare, 0.0, 1.0)]
-            bend = float(np.ptp(speed * self._bend(t, clock.minutes, self.duration / 60.0)))
-            if bend > LEAST_BEND:
-                law += self._misfit(t, clock.minutes, INFERENCE.held_oil.misfit * bend)
+            law = [] if clock.zero is None else [Column(speed * clock.zero, 0.0, 1.0)]
             fits.append(regression.fit_rate([Column(clock.minutes), *base, *law], alternatives))
             fits[-1] = fits[-1]._replace(converted=clock.convert(fits[-1].rate))
             logs.append(math.log(clock.weight) + fits[-1].log_evidence)
         return pool_fits(fits, logs)
 
-    def _fit_leak(self, regression: RateRegression, base: Sequence[Column], sizes: Sequence[float]) -> RateFit:
-        """Fit the rate of a leak [mm/min] under each law, with temperature and what settles."""
+    def _fit_leak(self, regression: RateRegression, base: Sequence[Column], deviation: float) -> RateFit:
+        """Fit the rate of a leak [mm/min] under each law, with temperature and what settles.
+
+        `deviation`: of the effect of a logged temperature, relative to the terms of `base`.
+        """
         readings = regression.readings
-        alternatives = [self._settling(readings, sizes), self._cooling(readings)]
+        length, _ = self.column
+        settling = self._settling(readings, self._strain_sizes(length))
+        alternatives = [settling, self._bends(readings), self._cooling(readings, length, deviation)]
         fit = self._fit_laws(regression, base, alternatives, self._clocks(readings))
         # oil that cools unlogged follows an exponential but for a share, which is as straight as a leak
-        is_logged = bool(self._thermal_columns(readings.t[:1]))
-        misfit = 0.0 if is_logged else HOLD.cooling.misfit * float(np.ptp(fit.last)) / (self.duration / 60.0)
-        return fit._replace(rate=fit.rate.add_error(misfit))
+        misfit = 0.0 if self.logged_temperature else HOLD.cooling.misfit * float(np.ptp(fit.last))
+        return fit._replace(rate=fit.rate.add_error(misfit / (self.duration / 60.0)))
 
     def _make_curve(self, channel: str, unit: str, readings: Readings, fit: RateFit, factor: float) -> HoldCurve:
         """Make the curve of a hold from readings to be drawn; `factor`: from the unit of the fit to theirs."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from itertools import compress
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -27,6 +28,8 @@ from sealscope.recordings.motion import is_constant
 from sealscope.recordings.quality import Finding, inspect
 from sealscope.recordings.recording import Array, Recording
 from sealscope.units import BAR
+
+_UNLOADED = "a rest without a load across the piston is no hold, and is not judged"
 
 
 @checked_call
@@ -113,7 +116,8 @@ def hold_test(
     if moment is None and (start_s := start_seconds(recording, name)) is not None:
         moment = np.datetime64(round(start_s - float(samples.t[0])), "s")  # of t = 0
     date = None if moment is None else str(moment)
-    parts = _cut_holds(samples, set_up)
+    parts, rests = _cut_holds(samples, set_up)
+    findings += [] if not rests else [Finding("unloaded_rest", "note", None, len(rests), rests[0], _UNLOADED)]
     with threadpool_limits(limits=1):  # faster for small matrices, and the results do not depend on the machine
         return tuple(judge_hold(HeldLoad(part, set_up, name, findings, date)) for part in parts)
 
@@ -123,14 +127,16 @@ def judge_held_recording(
 ) -> tuple[HoldResult, ...]:
     """Judge a recording of a held load, or return no result if it is none.
 
-    It is one if it has a position in units of length, its pump and command rest, and `hold_test` finds holds in it that
-    last for the fraction `part.share` (`priors.toml`) of its duration or longer. Pressures in raw counts are left out.
-    `areas` [m^2]: of the sides A and B; `limit`: as of `hold_test`. Those that it refuses also give no result.
+    It is one if it has a position in units of length or, without any position, a chamber pressure, if its pump and
+    command rest, and if `hold_test` finds holds in it that last for the fraction `part.share` (`priors.toml`) of its
+    duration or longer. Pressures in raw counts are left out. `areas` [m^2]: of the sides A and B; `limit`: as of
+    `hold_test`. Those that it refuses also give no result.
     """
-    if "x" not in recording or recording.units["x"] == COUNTS or not _is_pump_at_rest(recording):
+    measured = recording.only(name for name in recording.channels if recording.units[name] != COUNTS)
+    read = ("x",) if "x" in recording else CHAMBERS
+    if not any(name in measured for name in read) or not _is_pump_at_rest(recording):
         return ()
     try:
-        measured = recording.only(name for name in recording.channels if recording.units[name] != COUNTS)
         results = hold_test(measured, area=areas, limit=limit)
     except InputError:
         return ()
@@ -172,10 +178,11 @@ def _select_samples(recording: Recording) -> Recording:
     return kept._select(rows, "samples of a hold")
 
 
-def _cut_holds(samples: Recording, set_up: SetUp) -> list[Recording]:
+def _cut_holds(samples: Recording, set_up: SetUp) -> tuple[list[Recording], list[float]]:
     """Cut the holds out of a log, or out of the part whose start or end is stated; with both, this part is the hold.
 
-    A part without a load (`_find_load`) is none. Raises InputError if no hold is left.
+    Returns them, and the starts [s] of rests without a load across the piston (`_find_load`), which are none. Raises
+    InputError if no hold is left.
     """
     extent, shortest = f"in a log of {len(samples)} samples over {samples.duration:.3g} s", HOLD.part.shortest
     low, high = (-np.inf if set_up.start is None else set_up.start), (np.inf if set_up.end is None else set_up.end)
@@ -193,14 +200,16 @@ def _cut_holds(samples: Recording, set_up: SetUp) -> list[Recording]:
         raise InputError(f"a hold must last {shortest:g} s with 5 samples or more, got {longest} {extent}")
     load, tank = _find_load(pressures), HOLD.other.tank * BAR
     # beside a position, a single chamber may be the one without the load
-    if load is not None and (len(pressures) > 1 or x is None or float(np.median(load)) > tank):
-        loads = [float(np.mean(load[first : last + 1])) for first, last in held]
-        if max(loads) < tank:
-            sides = " across the piston" if len(pressures) > 1 else ""
-            got = f"{max(loads) / BAR:.2g} bar {extent}"
-            raise InputError(f"a hold needs a load of {tank / BAR:g} bar or more{sides}, got {got}")
-        held = [part for part, held_load in zip(held, loads, strict=True) if held_load >= tank]
-    return [samples.samples(slice(first, last + 1)) for first, last in held]
+    if load is None or (len(pressures) == 1 and x is not None and float(load.mean()) < tank):
+        return [samples.samples(slice(first, last + 1)) for first, last in held], []
+    loads = [float(load[first : last + 1].mean()) for first, last in held]
+    if max(loads) < tank:
+        sides = " across the piston" if len(pressures) > 1 else ""
+        got = f"{max(loads) / BAR:.2g} bar {extent}"
+        raise InputError(f"a hold needs a load of {tank / BAR:g} bar or more{sides}, got {got}")
+    is_loaded = [held_load >= tank for held_load in loads]
+    holds = [samples.samples(slice(first, last + 1)) for first, last in compress(held, is_loaded)]
+    return holds, [float(t[first]) for (first, _), loaded in zip(held, is_loaded, strict=True) if not loaded]
 
 
 def _find_load(pressures: Sequence[Array]) -> Array | None:

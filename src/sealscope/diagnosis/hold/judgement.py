@@ -163,7 +163,7 @@ def find_minutes(hold: HeldLoad, margin: float) -> float | None:
     def suffices(total: float) -> bool:
         """Test whether a hold of `total` minutes makes the half-width small enough."""
         error = predict_rate_error(total, n_readings * total, noise, fit.s, hold.duration, length, hold.warming)
-        return WITHIN_95 * error < margin
+        return WITHIN_95 * math.hypot(error, hold.thermal_error / total) < margin
 
     n_tried = max(math.ceil(math.log(LONGEST_ADVISED / minutes) / math.log(TRIED_RATIO)), 0)
     totals = [minutes * TRIED_RATIO**k for k in range(1, n_tried + 1)]

@@ -32,6 +32,8 @@ N_BETWEEN = 10
 SMOOTH_DEGREE, SMOOTH_TIMES, MAX_CORRELATION = 4, (0.02, 0.06, 0.2), 0.3
 #: Largest residual of such a course, root mean square over the noise of the means.
 MAX_MISFIT = 1.5
+#: Quantile of a chamber's pressure that counts as the pressure held.
+HIGHEST = 0.9
 #: Largest number of bins in which holds are sought.
 MAX_BINS = 20_000
 
@@ -170,7 +172,7 @@ def find_held_parts(t: Array, x: Array | None, pressures: Sequence[Array] = ()) 
     prior = HOLD.part
     step = float(np.median(np.diff(t)))
     n_bins = int(min(max((t[-1] - t[0]) / max(prior.bin, step), 1.0), MAX_BINS))
-    held = max((float(np.median(p)) for p in pressures), default=0.0)
+    held = max((float(np.quantile(p, HIGHEST)) for p in pressures), default=0.0)  # a leak may empty the chamber
     decay = min(prior.pressure * BAR, prior.decay * held) if held > 0.0 else prior.pressure * BAR
     speeds, decays = (prior.creep * 1e-3, prior.speed * 1e-3), (decay, decay)
     is_moving, bin_t = np.zeros(0, dtype=bool), t

@@ -30,12 +30,11 @@ from sealscope.recordings.recording import Array
 
 #: Points of the grid of log s^2 about its most probable value, in standard deviations sqrt(2/m).
 VARIANCE_POINTS = np.arange(-2.0, 6.0)
-#: Iterations that find the most probable variance.
-N_ITERATIONS = 3
-#: Combinations whose log likelihood, at the most probable variance, is lower than the best by more are left out.
-MAX_DECREASE = 14.0
-#: Smallest standard deviation of the noise of a mean, in the readings' unit.
-LEAST_DEVIATION = 1e-6
+#: Iterations that find the most probable variance, and the decrease of the log likelihood from the best beyond which a
+#: combination is left out after them; in two stages.
+STAGES = (1, 60.0), (3, 14.0)
+#: Smallest standard deviation of the noise of a mean, in the readings' unit, and over their range: no model is exact.
+LEAST_DEVIATION, LEAST_SHARE = 1e-6, 3e-4
 #: Ridge on the diagonal of the relative covariance of the noise.
 RIDGE = 1e-9
 #: Least pivot of the normal equations, of a coefficient that nothing tells.
@@ -155,7 +154,7 @@ class RateRegression:
         mean = np.array([*(column.mean for column in columns), 0.0])[choices]
         is_proper = precision > 0.0
         log_priors = log_priors + 0.5 * np.log(np.where(is_proper, precision, 1.0)).sum(axis=1)
-        m = len(self.y)
+        m, least = len(self.y), max(LEAST_DEVIATION, LEAST_SHARE * float(np.ptp(self.y))) ** 2
         freedom = float(max(m - int((~is_proper[0]).sum()), 1))
         whitened = self.whitening @ values
         gram = whitened.transpose(0, 2, 1) @ whitened
@@ -164,7 +163,7 @@ class RateRegression:
         prior = (self.log_noise[:, None] + log_priors).ravel()
         variance = np.ones(len(rows))
         if not quantum:
-            variance = np.maximum(np.repeat(gram[:, 0, 0], n_choices) / m, LEAST_DEVIATION**2)
+            variance = np.maximum(np.repeat(gram[:, 0, 0], n_choices) / m, least)
         # the rate is the last coefficient, which needs no back substitution
         system = (
             gram,
@@ -172,18 +171,22 @@ class RateRegression:
             precision[:, ::-1].copy(),
             mean[:, ::-1].copy(),
         )
-        solution, scratch = np.empty((len(rows), 3)), np.empty((choices.shape[1] + 1, choices.shape[1]))
-        _solve_rates(*system, rows, variance, freedom, 0 if quantum else N_ITERATIONS, scratch, solution)
-        profile = prior - 0.5 * (m * np.log(variance) + solution[:, 0])
-        rows = np.flatnonzero(profile > profile.max() - MAX_DECREASE)
-        log_step, grid = 0.0, variance[rows]
+        scratch = np.empty((choices.shape[1] + 1, choices.shape[1]))
+        for n_iterations, decrease in STAGES:
+            solution = np.empty((len(rows), 3))
+            n = 0 if quantum else n_iterations
+            _solve_rates(*system, rows, variance, freedom, least, n, scratch, solution)
+            profile = prior[rows] - 0.5 * (m * np.log(variance) + solution[:, 0])
+            is_probable = profile > profile.max() - decrease
+            rows, variance = rows[is_probable], variance[is_probable]
+        log_step, grid = 0.0, variance
         if not quantum:
             spread = math.sqrt(2.0 / freedom)
             log_step = math.log(spread)
-            grid = np.maximum(np.exp(spread * VARIANCE_POINTS)[:, None] * grid, LEAST_DEVIATION**2).ravel()
+            grid = np.maximum(np.exp(spread * VARIANCE_POINTS)[:, None] * grid, least).ravel()
             rows = np.tile(rows, len(VARIANCE_POINTS))
         solution = np.empty((len(rows), 3))
-        _solve_rates(*system, rows, grid, freedom, 0, scratch, solution)
+        _solve_rates(*system, rows, grid, freedom, least, 0, scratch, solution)
         logs = prior[rows] - 0.5 * (m * np.log(grid) + solution[:, 0]) + log_step
         weights = np.exp(logs - logs.max())
         best = int(weights.argmax())
@@ -226,6 +229,7 @@ def _solve_rates(
     rows: Any,
     variances: Any,
     freedom: float,
+    least: float,
     n_iterations: int,
     scratch: Any,
     solution: Any,
@@ -234,8 +238,8 @@ def _solve_rates(
 
     `gram` (n, q, q): whitened products of the readings (index 0) and columns for each noise; `choices`, `precision`,
     `mean` (c, p): columns of a combination and priors of their coefficients, that of the rate the last; `rows` (k,):
-    noise times c, plus combination; `variances` (k,): of the noise, replaced by the most probable in `n_iterations`.
-    Written are the misfit with the log determinant of the matrix, and the rate's deviation and mean.
+    noise times c, plus combination; `variances` (k,): of the noise, replaced in `n_iterations` by the most probable,
+    `least` or more. Written are the misfit with the log determinant of the matrix, and the rate's deviation and mean.
     `scratch` (p + 1, p) is working memory.
     """
     n_choices, p = choices.shape
@@ -264,7 +268,7 @@ def _solve_rates(
                 misfit -= right[i] ** 2
                 log_det += 2.0 * math.log(factor[i, i])
             if iteration < n_iterations:
-                variances[k] = max(variance * max(misfit, RIDGE) / freedom, LEAST_DEVIATION**2)
+                variances[k] = max(variance * max(misfit, RIDGE) / freedom, least)
         solution[k, 0] = misfit + log_det
         solution[k, 1] = 1.0 / factor[p - 1, p - 1]
         solution[k, 2] = right[p - 1] / factor[p - 1, p - 1]

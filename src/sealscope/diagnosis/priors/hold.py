@@ -27,11 +27,17 @@ class SettlingPriors(PriorTable):
 
     present: float  # probability that something settles within the hold
     times: tuple[float, ...]  # [s] time constants
-    emptying: tuple[float, ...]  # [durations of the hold] in which a leak falls off whose pressure is not logged
     longest: float  # [durations of the hold] longest of them
     stopped: float  # probability that oil that cools does not bend the travel, as of a piston at its stop
-    travel: tuple[float, ...]  # [mm] standard deviations of the amplitude of a position
     strain: tuple[float, ...]  # standard deviations of the amplitude of the oil's relative compression
+
+
+class BendPriors(PriorTable):
+    """A slow change of the speed about its mean."""
+
+    present: float  # its probability
+    times: tuple[float, ...]  # [durations of the hold] of exponential changes
+    sizes: tuple[float, ...]  # standard deviations, over the whole travel
 
 
 class CoolingPriors(PriorTable):
@@ -94,6 +100,15 @@ class OtherSide(PriorTable):
     tank: float  # [bar] largest pressure of a side that may be open to the tank
 
 
+class LoadPriors(PriorTable):
+    """Standard deviations of what a position does not tell of the oil."""
+
+    gauge: float  # relative error of area and position
+    friction: float  # [bar] variation of a free load's pressure that is not logged
+    change: float  # [bar] the same above a locked side
+    stiffness: float  # relative compression above a locked side or a spring
+
+
 class CollectedOil(PriorTable):
     """Errors of a collected volume."""
 
@@ -106,11 +121,13 @@ class HeldLoadPriors(PriorTable):
 
     part: HeldPart
     settling: SettlingPriors
+    bend: BendPriors
     cooling: CoolingPriors
     column: ColumnPriors
     tight: TightHolds
     noise: NoisePriors
     other: OtherSide
+    load: LoadPriors
     collected: CollectedOil
 
 
