@@ -112,7 +112,7 @@ def oracle(levels: Levels, prior: ScatterPrior, known: int) -> float:
 def test_the_statistic_is_the_ratio_of_the_likelihoods(monkeypatch: pytest.MonkeyPatch) -> None:
     """The sums of one factorisation against integrals of multivariate normal densities, unequal errors and waits."""
     monkeypatch.setitem(vars(TREND.between), "nodes", 3)
-    monkeypatch.setitem(vars(TREND.between), "lasts", (0.5,))
+    monkeypatch.setitem(vars(TREND.between), "lasting_share", (0.5,))
     levels = levels_at(np.array([0.0, 1.0, 3.0, 4.0]), np.array([5.0, 5.5, 6.2, 6.9]), np.array([0.1, 0.5, 0.2, 0.3]))
     assert not np.any(outlier_excess(levels))
     assert score_changes(levels, 2).log_R[-1] == pytest.approx(math.log(oracle(levels, PRIOR, 2)), abs=2e-3)

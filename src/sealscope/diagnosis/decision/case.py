@@ -95,8 +95,8 @@ def _inflation_posterior(surprisals: Sequence[float]) -> tuple[Array, Array]:
     log_inflation = np.append(0.0, np.linspace(0.0, np.log(priors.largest), NODES))
     inflation = np.exp(log_inflation)
     prior = np.exp(-log_inflation / priors.inflation)
-    prior[1:] *= priors.fails / prior[1:].sum()  # `fails`: fraction of machines with wrong p-values
-    prior[0] = 1.0 - priors.fails
+    prior[1:] *= priors.wrong_share / prior[1:].sum()  # `wrong_share`: fraction of machines with wrong p-values
+    prior[0] = 1.0 - priors.wrong_share
     log_posterior = np.log(prior) - len(surprisals) * log_inflation - float(np.sum(surprisals)) / inflation
     return weigh_alternatives(log_posterior), inflation
 

@@ -32,8 +32,8 @@ STANDSTILL: float = LIVE.block.standstill
 OUTDATED_BLOCKS = round(LIVE.coefficients.memory * -math.log(STANDSTILL))
 #: A block at standstill counts if its precision is over this fraction of the usual precision. After `N_WAKING`
 #: successive blocks that move far more than usual, the machine is taken to have stood still before.
-MIN_REST_PRECISION: float = LIVE.block.tells
-N_WAKING: int = LIVE.block.wakes
+MIN_REST_PRECISION: float = LIVE.block.rest_precision
+N_WAKING: int = LIVE.block.waking_blocks
 #: Factor per block by which the weight of earlier blocks decays, and the same for the shift of the series.
 _MEMORY: float = math.exp(-1.0 / LIVE.coefficients.memory)
 _SHIFT_DECAY: float = math.exp(-1.0 / LIVE.coefficients.returns)

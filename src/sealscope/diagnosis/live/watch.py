@@ -455,7 +455,7 @@ class Watch:
         anew.
         """
         n_since = self._count_since(rise.interval)
-        if n_since < _EXPLANATION.shows:
+        if n_since < _EXPLANATION.fewest_blocks:
             return UNKNOWN
         if rise.interval.value < self._since + _EXPLANATION.start * (block.end - block.begin):
             self._samples.count("changes that are no leak: a start")

@@ -77,8 +77,8 @@ class ChargePriors(PriorTable):
     """Drift of the charge pressure, seen in the lowest pressures of the chambers."""
 
     share: float  # smallest fraction of the samples in which a chamber fed at the charge pressure is low
-    near: float  # [Pa] a pressure is low if it exceeds the chamber's lowest pressure by at most this difference
-    range: float  # largest change by a drift over the recording, over `near`
+    band: float  # [Pa] a pressure is low if it exceeds the chamber's lowest pressure by at most this difference
+    range: float  # largest change by a drift over the recording, over `band`
     seconds: float  # [s] time over which pressures are averaged
     steady: float  # [Pa/s] a low pressure that changes faster is not the charge pressure
     scatter: float  # [Pa/s] standard deviation of the drift between days

@@ -18,7 +18,7 @@ class NullPriors(PriorTable):
     For right p-values the mean of -log(p-value) is 1. Wrong p-values are too small, and this mean is a factor > 1.
     """
 
-    fails: float  # fraction of machines on which the p-values of a test are wrong
+    wrong_share: float  # fraction of machines on which the p-values of a test are wrong
     inflation: float  # scale of the exponential prior on the logarithm of this factor
     largest: float  # largest factor
 

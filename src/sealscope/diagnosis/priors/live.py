@@ -16,9 +16,9 @@ class LiveBlocks(PriorTable):
 
     seconds: float  # [s] length of a block
     learned: int  # number of blocks before the first estimate
-    tells: float  # smallest precision of a block at standstill that is used, over that of a usual block
+    rest_precision: float  # smallest precision of a block at standstill that is used, over that of a usual block
     standstill: float  # a machine stands still if the mean square of its motion is below this fraction of the usual one
-    wakes: int  # the machine is learned anew after this number of blocks with far more motion than ever before
+    waking_blocks: int  # the machine is learned anew after this number of blocks with far more motion than ever before
 
 
 class CoefficientMemory(PriorTable):
@@ -73,7 +73,7 @@ class RiseExplanationPriors(PriorTable):
     """Search for the cause of an increase of the leakage in the blocks around it."""
 
     window: int  # number of blocks that are stored
-    shows: int  # number of blocks since the onset before a cause is looked for
+    fewest_blocks: int  # number of blocks since the onset before a cause is looked for
     rare: float  # largest p-value (probability in a healthy machine) of a change that shows in the blocks
     start: int  # [blocks] time after a pause within which an increase is due to the start of the machine
     settles: int  # number of blocks since the onset after which the explanation is final

@@ -11,7 +11,7 @@ class LevelDeviation(PriorTable):
     ringing: float  # standard deviation of the logarithm of the RMS of the pressures' wavelet details (their ringing)
     nodes: int  # number of values of the standard deviation, on a grid, over which results are averaged
     freedom: float  # degrees of freedom of the prior
-    lasts: tuple[float, ...]  # fractions of the variance that are correlated over time, each equally likely
+    lasting_share: tuple[float, ...]  # fractions of the variance that are correlated over time, each equally likely
     times: tuple[float, ...]  # [d] correlation times
 
 

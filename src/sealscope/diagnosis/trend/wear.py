@@ -228,7 +228,7 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
     for tau in np.geomspace(0.1 * prior.scale, 10.0 * max_scatter, between.nodes):
         # scaled inverse chi-square, as a density of log tau, in which the grid is uniform
         log_prior = -prior.freedom * (math.log(tau) + 0.5 * (prior.scale / tau) ** 2)
-        for r in between.lasts:
+        for r in between.lasting_share:
             covariance = shared + tau**2 * r * correlation
             covariance[np.diag_indices(len(levels))] += tau**2 * (1.0 - r + _JITTER) + levels.error**2 + rounding
             L = np.linalg.cholesky(covariance)

@@ -71,10 +71,10 @@ def estimate_low_drifts(recording: Recording) -> Mapping[str, Estimate]:
     """Estimate the drifts [Pa/s] of the lowest pressures of the chambers, by their names "A" and "B".
 
     In a closed circuit a chamber that carries no load is at the charge pressure. Samples count if they are within
-    `charge.near` (`priors.toml`) of the chamber's lowest pressure, its quantile `LOWEST`, and change more slowly than
+    `charge.band` (`priors.toml`) of the chamber's lowest pressure, its quantile `LOWEST`, and change more slowly than
     `charge.steady` [Pa/s]: a load that swings through zero lowers the pressure only for a moment. While the pump rests
     no sample counts, as shut valves may enclose any pressure. A chamber is left out if its lowest pressure exceeds that
-    of the other chamber by `charge.near` or more, if at most the fraction `charge.share` of the samples of a turning
+    of the other chamber by `charge.band` or more, if at most the fraction `charge.share` of the samples of a turning
     pump counts, or if these do not determine the drift (`_fit_drift`). The result is empty for a recording shorter than
     `MIN_SAMPLES`, and if a pressure, or both angle and speed of the pump, are not recorded. It is cached.
     """
@@ -99,8 +99,8 @@ def _estimate_low_drifts(recording: Recording) -> dict[str, Estimate]:
     for side, p, low in zip("AB", pressures, lowest, strict=True):
         slope = np.full(len(p), np.nan)  # over twice `charge.seconds`; samples at the ends, with NaN, do not count
         slope[window:-window] = (p[2 * window :] - p[: -2 * window]) * rate / (2 * window)
-        is_low = is_known & np.isfinite(p) & (p < low + prior.near) & (np.abs(slope) < prior.steady)
-        if low < min(lowest) + prior.near and is_low.sum() > prior.share * is_known.sum():
+        is_low = is_known & np.isfinite(p) & (p < low + prior.band) & (np.abs(slope) < prior.steady)
+        if low < min(lowest) + prior.band and is_low.sum() > prior.share * is_known.sum():
             drift = _fit_drift(recording.t, p, regressors, np.flatnonzero(is_low))
             if drift is not None:
                 drifts[side] = drift
@@ -184,7 +184,7 @@ def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.in
     The envelope is a robust fit in which samples above it count less than those below. `regressors` (n, k): pump flow
     and position, which are fitted together with the drift; `rows`: indices of the samples to fit, which are thinned out
     if they are many. Return None for fewer than `MIN_SAMPLES` samples, without a finite standard error, and if the
-    drift over the recording reaches `charge.range` times `charge.near`: as all samples lie within `charge.near`, such a
+    drift over the recording reaches `charge.range` times `charge.band`: as all samples lie within `charge.band`, such a
     drift comes from too few visits to the charge pressure.
     """
     rows = rows[:: max(1, len(rows) // MAX_SAMPLES)]
@@ -207,7 +207,7 @@ def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.in
     parts = equal_parts(len(rows))
     (jackknife_error,) = jackknife_errors(equations, weight, [slope], parts)
     drift = Estimate(float(coefficients[slope]), float(np.hypot(jackknife_error, _envelope_error(time, residual))))
-    is_determined = abs(drift.value) * np.ptp(time) < CHANGES.charge.range * CHANGES.charge.near
+    is_determined = abs(drift.value) * np.ptp(time) < CHANGES.charge.range * CHANGES.charge.band
     return drift if is_determined and np.isfinite(drift).all() else None
 
 
