@@ -7,6 +7,7 @@ import pytest
 
 import sealscope as ss
 from sealscope.diagnosis.commissioned.machine import summarise_healthy
+from sealscope.diagnosis.commissioned.watched import measured_rig
 from sealscope.diagnosis.live.joining import SampleRun
 from sealscope.diagnosis.live.kernel.stream import RESULTS, StreamSettings
 from sealscope.diagnosis.live.live_balance import LiveBalance, NotJudged
@@ -14,7 +15,7 @@ from sealscope.diagnosis.live.sequential import StepDetector
 from sealscope.diagnosis.verdict.machine_sizes import unstated_rig
 from sealscope.emit.c_export import parts_a_sample, render_c
 from sealscope.emit.compiler import find_compiler
-from sealscope.emit.export import absolute_offsets, controller_inputs, controller_rig
+from sealscope.emit.export import absolute_offsets, controller_inputs
 from sealscope.emit.run_program import CompiledStream
 from sealscope.emit.single_precision import iter_blocks
 from sealscope.emit.st_export import render_st
@@ -277,8 +278,8 @@ def test_a_controller_takes_inputs_and_displacement_from_the_machines_file(tmp_p
     rig = unstated_rig().with_areas(RIG.cylinder.A_A, RIG.cylinder.A_B, source="nameplate")
     rig = rig.with_overrides({"pump.q_b": 2.0 * RIG.pump.q_b}, source=rig.entry("pump.q_b").source)
     known = ss.CommissionedMachine("m", (summarise_healthy(recording, rig, "a"),), rig)
-    assert controller_rig(known).pump.q_b == pytest.approx(RIG.pump.q_b, rel=0.02)
-    assert controller_rig(known).states("pump.q_b") and not rig.states("pump.q_b")
+    assert measured_rig(known).pump.q_b == pytest.approx(RIG.pump.q_b, rel=0.02)
+    assert measured_rig(known).states("pump.q_b") and not rig.states("pump.q_b")
     assert controller_inputs(recording) == controller_inputs(known.healthy[0]) == (50.0, "theta")
     in_counts = Recording(recording.t, recording.channels, {**recording.units, "p_B": "count"}, 50.0)
     with pytest.raises(InputError, match="raw counts of p_B"):

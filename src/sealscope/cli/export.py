@@ -33,7 +33,8 @@ def export(
     It estimates leakage and leak in m^3/s with 95 % intervals from chamber pressures, the pump's flow and the position.
     """
     from sealscope.diagnosis.commissioned.machine_file import read_machine
-    from sealscope.emit.export import controller_inputs, controller_rig, export_controller
+    from sealscope.diagnosis.commissioned.watched import measured_rig
+    from sealscope.emit.export import controller_inputs, export_controller
     from sealscope.parameters import load_rig
     from sealscope.recordings import read
     from sealscope.units import parse_quantity
@@ -41,7 +42,7 @@ def export(
     if machine is not None and rig is not None:
         raise InputError("--rig cannot be combined with --machine, whose file states the sizes")
     known = None if machine is None else read_machine(machine)
-    sizes = load_rig(rig or "thesis") if known is None else controller_rig(known)
+    sizes = load_rig(rig or "thesis") if known is None else measured_rig(known)
     paths = learn or []
     recordings = [read(path, map="auto") if known is None else known.read(path) for path in paths]
     learned_rate, learned_flow = None, None

@@ -11,15 +11,12 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.commissioned.machine import CommissionedMachine
 from sealscope.diagnosis.healthy import Healthy
-from sealscope.diagnosis.inference.comparison.recording_sums import BalanceSummary
 from sealscope.diagnosis.inference.equations.balances import PUMP_VOLUMES, absolute_offset
 from sealscope.diagnosis.inference.rows.row_weights import SUPPORT
 from sealscope.diagnosis.live.joining import SampleRun
 from sealscope.diagnosis.live.kernel.stream import RESULTS, StreamSettings
 from sealscope.diagnosis.live.live_balance import BLOCK_SECONDS, LiveBalance, NotJudged
-from sealscope.diagnosis.verdict.machine_sizes import measures_flow, unstated_rig
 from sealscope.emit.c99 import Precision
 from sealscope.emit.c_export import parts_a_sample, render_c, render_vectors
 from sealscope.emit.run_program import CompiledStream
@@ -168,21 +165,6 @@ def export_controller(
 def _flow_source(channels: Container[str]) -> str | None:
     """Choose the best of the channels that give a controller the pump's flow; None if all are absent."""
     return next((name for name in PUMP_VOLUMES if name in channels), None)
-
-
-def controller_rig(machine: CommissionedMachine) -> Rig:
-    """Return the rig of a machine; if its displacement is not stated, with the one that healthy recordings show.
-
-    Where the piston's areas are stated, the balance of each recording shows the displacement as a multiple of the
-    assumed one (`BalanceSummary.scale`); here the median counts.
-    """
-    rig = machine.rig or unstated_rig()
-    recordings = [recording for recording in machine.healthy if not measures_flow(recording.units)]
-    summaries = [recording.summary(BalanceSummary) for recording in recordings]
-    scales = [summary.scale for summary in summaries if summary is not None and summary.scale > 0.0]
-    if rig.states("pump.q_b") or not scales:
-        return rig
-    return rig.with_overrides({"pump.q_b": rig.pump.q_b * float(np.median(scales))}, source="by the piston's areas")
 
 
 def controller_inputs(recording: Healthy) -> tuple[float, str]:

@@ -59,11 +59,11 @@ def load_watched(rig: str) -> WatchedMachine:
         named_rig = load_rig(rig)
         return WatchedMachine(named_rig, named_rig.channel_map)
     machine = read_machine(rig)
-    measured_rig = _with_measured_displacement(machine.rig or unstated_rig(), machine.healthy)
-    cylinder = measured_rig.cylinder
-    area = 0.5 * (cylinder.A_A + cylinder.A_B) if measured_rig.states(*_AREAS) else None
+    sizes = measured_rig(machine)
+    cylinder = sizes.cylinder
+    area = 0.5 * (cylinder.A_A + cylinder.A_B) if sizes.states(*_AREAS) else None
     return WatchedMachine(
-        measured_rig,
+        sizes,
         machine.channel_map,
         machine.rate,
         limit_lpm=RepairLimit.parse(machine.limit).flow_lpm(area),
@@ -72,23 +72,16 @@ def load_watched(rig: str) -> WatchedMachine:
     )
 
 
-def is_remeasured(rig: Rig, rig_before: Rig) -> bool:
-    """Return True if two rigs differ only in the pump displacement, and by 5 % at most, like repeated measurements."""
-    values, values_before = rig.model_dump(), rig_before.model_dump()
-    for tree in (values, values_before):
-        tree.get("pump", {}).pop("q_b", None)
-    return values == values_before and bool(np.isclose(rig.pump.q_b, rig_before.pump.q_b, rtol=0.05))
+def measured_rig(machine: CommissionedMachine) -> Rig:
+    """Return the rig of a machine; if it states only piston areas, with the displacement that healthy recordings show.
 
-
-def _with_measured_displacement(rig: Rig, healthy: tuple[SummarisedRecording, ...]) -> Rig:
-    """Replace the displacement of a rig that states only piston areas by the median of the healthy recordings.
-
-    Any other rig is returned unchanged, and so is one whose healthy recordings do not measure the displacement.
+    That is the median of the recordings. Where none measures it, and for any other rig, the rig is returned unchanged.
     """
+    rig = machine.rig or unstated_rig()
     if rig.states(_DISPLACEMENT) or not rig.states(*_AREAS):
         return rig
     # a flow meter needs no displacement, and does not measure it
-    by_pump = (recording for recording in healthy if flow_source(recording.units) not in METERS)
+    by_pump = (recording for recording in machine.healthy if flow_source(recording.units) not in METERS)
     summaries = (recording.summary(BalanceSummary) for recording in by_pump)
     # measured over assumed displacement, 0 if not measured
     scales = [summary.scale for summary in summaries if summary is not None and summary.scale > 0.0]
@@ -96,6 +89,14 @@ def _with_measured_displacement(rig: Rig, healthy: tuple[SummarisedRecording, ..
         return rig
     source = f"measured by {len(scales)} healthy recordings beside the stated areas"
     return rig.with_overrides({_DISPLACEMENT: float(np.median(scales)) * rig.pump.q_b}, source=source)
+
+
+def is_remeasured(rig: Rig, rig_before: Rig) -> bool:
+    """Return True if two rigs differ only in the pump displacement, and by 5 % at most, like repeated measurements."""
+    values, values_before = rig.model_dump(), rig_before.model_dump()
+    for tree in (values, values_before):
+        tree.get("pump", {}).pop("q_b", None)
+    return values == values_before and bool(np.isclose(rig.pump.q_b, rig_before.pump.q_b, rtol=0.05))
 
 
 def _healthy_level(healthy: tuple[SummarisedRecording, ...], rig: Rig) -> HealthyLevel | None:
