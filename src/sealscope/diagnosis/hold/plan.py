@@ -95,7 +95,8 @@ class PlannedHold(NamedTuple):
         oil = f"oil that changes by {self.warming:g} K unlogged" if self.warming else oil
         text = (
             f"hold {self.force / 1e3:.3g} kN for {self.minutes:g} min at {self.pressure / BAR:.3g} bar, valves shut: "
-            f"`sealscope hold`\n  shows creep of {creep:.2g} mm/min, a leak of {leak:.2g} mL/min, {oil}"
+            f"`sealscope hold`\n  shows creep of {creep:.2g} mm/min and a leak of {leak:.2g} mL/min,\n"
+            f"  with the loaded side's pressure logged, and {oil}"
         )
         if not 0.0 < self.find < self.leak:
             return text
@@ -117,7 +118,8 @@ def plan_hold(
     """Find the shortest hold that shows a leak of the flow `find` [m^3/s], or what ten minutes show without it.
 
     `force` [N]: load; `area` [m^2]: of the loaded side; `length` [m]: of its oil column, known to the relative
-    `length_deviation`; `step`, `noise` [m]: encoder step and noise of the position; `warming` [K]: as of `PlannedHold`,
+    `length_deviation`; `step`, `noise` [m]: encoder step and noise of the position, beside which the pressure of the
+    loaded side is logged: a position alone shows less of a leak; `warming` [K]: as of `PlannedHold`,
     of which the test allows what its prior does; `detection`: probability that the leak's interval excludes zero. If no
     duration in `HOLD_MINUTES` suffices, the longest is planned. Raises InputError for a load or an area that is not
     above 0.
