@@ -13,7 +13,7 @@ import re
 from collections.abc import Collection, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from datetime import date
+from datetime import UTC, date, datetime
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -242,12 +242,16 @@ def clock_text(clock: float) -> str:
 
 
 def parse_epoch(stamp: str) -> float | None:
-    """Parse an ISO date and time, taken as UTC, to seconds since 1970, to a millisecond; None for any other text."""
+    """Parse an ISO date and time to seconds since 1970, to a millisecond; None for any other text.
+
+    A stamp without an offset such as `Z` or `+02:00` is taken as UTC.
+    """
     try:
-        moment = np.datetime64(stamp, "ms")
+        moment = datetime.fromisoformat(stamp)
     except ValueError:
         return None
-    return None if np.isnat(moment) else float(moment.astype(np.int64)) / 1e3
+    moment = moment.replace(tzinfo=moment.tzinfo or UTC, microsecond=moment.microsecond // 1000 * 1000)
+    return moment.timestamp()
 
 
 def _format_clock(text: str) -> str:
