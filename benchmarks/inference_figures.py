@@ -16,7 +16,7 @@ import sealscope as ss
 from sealscope.diagnosis.estimate.change import Information, fit_history, step_test
 from sealscope.diagnosis.inference.blocks import information
 from sealscope.diagnosis.inference.regimes import recorded_blocks
-from sealscope.diagnosis.inference.rows.weak_form import SPAN, peak_weight, row_weight, stride_samples
+from sealscope.diagnosis.inference.rows import SPAN, peak_weight, row_weight, stride_samples
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Array
 from sealscope.units import LITRE_PER_MINUTE

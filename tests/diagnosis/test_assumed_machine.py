@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.assumed_rig import assumed_rig, infer_rig
-from sealscope.diagnosis.detectors import observation
+from sealscope.diagnosis.detectors import registry
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.inference.pressures.response_detector import PressureResponse
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
@@ -249,7 +249,7 @@ def test_a_rig_is_loaded_once(foreign: Recording, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("sealscope.diagnosis.assumed_rig.load_rig", load)
     assert diagnose(foreign, rig="thesis").machine is not None
     assert loaded == ["thesis"]
-    assert not hasattr(observation, "load_rig")
+    assert not hasattr(registry, "load_rig")
 
 
 @pytest.mark.slow

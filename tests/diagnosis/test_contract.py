@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.detectors import observation
+from sealscope.diagnosis.detectors import registry
 from sealscope.diagnosis.detectors.registry import detectors, validate_report
 from sealscope.diagnosis.diagnose import Examination, diagnose
 from sealscope.diagnosis.rms_change.rms_detector import RmsChange
@@ -102,7 +102,7 @@ def leaky(records) -> Recording:  # type: ignore[no-untyped-def]
 @pytest.fixture(autouse=True)
 def every_detector(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let examinations find the example by its name."""
-    monkeypatch.setattr(observation, "detectors", lambda: EVERY)
+    monkeypatch.setattr(registry, "detectors", lambda: EVERY)
 
 
 #: Detectors that say when something changed; others need only say whether.

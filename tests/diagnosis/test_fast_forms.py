@@ -9,7 +9,7 @@ import pytest
 from scipy.ndimage import median_filter
 
 from sealscope.diagnosis.estimate.change import WALKS, Information, step_test
-from sealscope.diagnosis.inference.changes.pressure_bands import _octave_powers
+from sealscope.diagnosis.inference.changes.healthy_levels import _octave_powers
 from sealscope.diagnosis.inference.machine_states import AVERAGING_TIME, MIN_REST, extend_flags, find_rests
 from sealscope.recordings.recording import Array, Recording
 

@@ -9,8 +9,13 @@ import pytest
 from scipy.signal import butter, sosfilt
 
 from sealscope.diagnosis.healthy import SummarisedRecording, summary_table
-from sealscope.diagnosis.inference.changes.healthy_levels import HealthyLevels
-from sealscope.diagnosis.inference.changes.pressure_bands import PAIRS, Octaves, compare_spectra, compute_octaves
+from sealscope.diagnosis.inference.changes.healthy_levels import (
+    PAIRS,
+    HealthyLevels,
+    Octaves,
+    compare_spectra,
+    compute_octaves,
+)
 from sealscope.recordings.recording import Recording
 
 RATE, SECONDS = 100.0, 40.0

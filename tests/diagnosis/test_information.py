@@ -8,8 +8,7 @@ import pytest
 from sealscope.diagnosis.estimate.linear import solve
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, Weighting, information
 from sealscope.diagnosis.inference.equations.terms import LEAK, Equation, Term
-from sealscope.diagnosis.inference.rows.row_weights import HUBER, SUPPORT, block_gram_matrices
-from sealscope.diagnosis.inference.rows.weak_form import OVERLAP, weak_form_rows
+from sealscope.diagnosis.inference.rows import HUBER, OVERLAP, SUPPORT, block_gram_matrices, weak_form_rows
 from sealscope.diagnosis.priors.inference import INFERENCE
 
 FIELDS = tuple(Blocks.__dataclass_fields__)

@@ -137,7 +137,7 @@ def test_a_verdict_beside_recordings_that_were_learnt_before_is_the_same(
 
     for detector in (VolumeBalance, HealthyLevels):
         monkeypatch.setattr(detector, "learn", fail)
-    monkeypatch.setattr("sealscope.diagnosis.detectors.observation._compute_surprisals", fail)
+    monkeypatch.setattr("sealscope.diagnosis.detectors.registry._compute_surprisals", fail)
     inspect, inspected = inspection._inspect, list[ss.Recording]()
     monkeypatch.setattr(
         inspection, "_inspect", lambda *arguments: inspected.append(arguments[0]) or inspect(*arguments)

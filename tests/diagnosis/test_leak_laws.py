@@ -9,7 +9,7 @@ import pytest
 
 from sealscope.diagnosis.estimate.change import Information, step_test
 from sealscope.diagnosis.inference.equations.terms import LEAK, ORIFICE
-from sealscope.diagnosis.inference.leak_law import find_leak_step
+from sealscope.diagnosis.inference.leak_flow import find_leak_step
 from sealscope.diagnosis.inference.pressures.response_detector import PressureResponse
 from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.parameters import load_rig

@@ -10,7 +10,7 @@ import pytest
 
 from sealscope.diagnosis.estimate.change import Information, step_test
 from sealscope.diagnosis.inference.equations.balances import equations, flag_circulation
-from sealscope.diagnosis.inference.equations.signals import Signals
+from sealscope.diagnosis.inference.equations.terms import Signals
 from sealscope.diagnosis.inference.hypotheses import HoldCounts
 from sealscope.diagnosis.inference.machine_states import LoweringLimits, RestLimits, flag_lowering, largest_before
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak

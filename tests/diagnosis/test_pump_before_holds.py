@@ -6,11 +6,9 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.estimate.interval import Estimate
-from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
+from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks, estimate_pump_leakage
 from sealscope.diagnosis.inference.circuit.holds.recorded_hold import find_locked_holds
-from sealscope.diagnosis.inference.comparison.levels import held_pump_rise
-from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums, Resistance
-from sealscope.diagnosis.inference.volumes.held_pump import estimate_pump_leakage
+from sealscope.diagnosis.inference.comparison import RecordingSums, Resistance, held_pump_rise
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Recording
 from sealscope.units import P_ATM

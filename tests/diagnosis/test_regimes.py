@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.inference.comparison.levels import Rise
-from sealscope.diagnosis.inference.comparison.recording_sums import BalanceSummary
+from sealscope.diagnosis.inference.comparison import BalanceSummary, Rise
 from sealscope.diagnosis.inference.equations.terms import TURNING
 from sealscope.diagnosis.inference.hypotheses import MachineOdds, Valves
 from sealscope.diagnosis.inference.machine_states import AVERAGING_TIME, find_rests, rest_limit

@@ -11,15 +11,17 @@ from scipy.stats import binom, kstest, norm
 
 from sealscope.diagnosis.estimate.population import Mixture, Population, ScatterPrior
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, scale_grams
-from sealscope.diagnosis.inference.comparison.levels import Rise, rise, rise_of_mixture
-from sealscope.diagnosis.inference.comparison.recording_sums import (
+from sealscope.diagnosis.inference.comparison import (
     RecordingSums,
     Resistance,
+    Rise,
     block_weights,
     eliminate_unshared,
     estimate_leak_excess,
     find_unusual_conditions,
     motion_change,
+    rise,
+    rise_of_mixture,
 )
 from sealscope.diagnosis.inference.equations.terms import LAG, LEAK, Equation, Term
 from sealscope.diagnosis.inference.volumes.volume_detector import compare_motion

@@ -11,8 +11,7 @@ import pytest
 from sealscope.diagnosis.estimate.change import Information
 from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.inference.equations.terms import LEAK, ORIFICE
-from sealscope.diagnosis.inference.leak_law import find_leak_step
-from sealscope.diagnosis.inference.volumes.leak_flow import RiseFits, fit_rise
+from sealscope.diagnosis.inference.leak_flow import RiseFits, find_leak_step, fit_rise
 from sealscope.recordings.recording import Array
 
 K, BLOCK_S, PRESSURE = 60, 2.0, 5e6

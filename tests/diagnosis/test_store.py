@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.inference.circuit.without_position import oil_loss_tests
-from sealscope.diagnosis.inference.equations.signals import Signals
+from sealscope.diagnosis.inference.equations.terms import Signals
 from sealscope.parameters import Rig, load_rig
 from sealscope.units import P_ATM
 

@@ -9,7 +9,7 @@ from sealscope.diagnosis.estimate.interval import WITHIN_95
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.equations.balances import equations, shut_at_rest
 from sealscope.diagnosis.inference.equations.terms import BIAS, HOLDING, LEAK, TURNING
-from sealscope.diagnosis.inference.volumes.total import StateLoad, StateLoads, estimate_total_flow
+from sealscope.diagnosis.inference.leak_flow import StateLoad, StateLoads, estimate_total_flow
 from sealscope.parameters import load_rig
 
 N_BLOCKS, N_ROWS, NOISE = 40, 24, 2e-7

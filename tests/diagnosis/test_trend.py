@@ -21,7 +21,7 @@ from sealscope.diagnosis.trend.machine_trend import Trend
 from sealscope.diagnosis.trend.machine_trend import trend as trend_of
 from sealscope.diagnosis.trend.reading import LeakReading, estimate_reading
 from sealscope.diagnosis.trend.wear import Levels, ScatterPrior, outlier_excess, score_changes
-from sealscope.recordings.oil import oil_temperature
+from sealscope.recordings.header import oil_temperature
 from sealscope.units import DAY, DAYS_PER_MONTH, LITRE_PER_MINUTE
 
 from ..refusals import refusal

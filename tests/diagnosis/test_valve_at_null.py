@@ -13,7 +13,7 @@ import pytest
 import sealscope as ss
 from sealscope.diagnosis.inference.block_stream import BlockStream
 from sealscope.diagnosis.inference.blocks import ColumnRoles
-from sealscope.diagnosis.inference.comparison.recording_sums import estimate_leak_excess
+from sealscope.diagnosis.inference.comparison import estimate_leak_excess
 from sealscope.diagnosis.inference.equations.balances import bridged_samples, equations, is_separate_at_rest
 from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.inspection import inspect_recording

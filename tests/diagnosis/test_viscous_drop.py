@@ -9,8 +9,7 @@ import pytest
 
 from sealscope.diagnosis.commissioned.healthy_file import check_summary
 from sealscope.diagnosis.inference.changes.motion_fit import fit_difference
-from sealscope.diagnosis.inference.comparison.levels import oil_hypotheses
-from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums, Resistance
+from sealscope.diagnosis.inference.comparison import RecordingSums, Resistance, oil_hypotheses
 from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.parameters import load_rig

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.special import spherical_jn
 
-from sealscope.diagnosis.inference.rows.weak_form import SPAN, STRIDE, stride_samples, weak_form_rows
+from sealscope.diagnosis.inference.rows import SPAN, STRIDE, stride_samples, weak_form_rows
 
 RATES = (80.0, 160.0, 320.0, 640.0)  # whole samples a stride
 

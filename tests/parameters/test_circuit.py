@@ -11,7 +11,7 @@ import pytest
 import sealscope
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.parameters import load_rig, rig_names
-from sealscope.parameters.circuit import CIRCUITS, PUMP_CIRCUIT, VALVE_CIRCUIT, check_circuit_property
+from sealscope.parameters.parts import CIRCUITS, PUMP_CIRCUIT, VALVE_CIRCUIT, check_circuit_property
 from sealscope.parameters.rig import declared_names
 from sealscope.physics.rig import rig_numbers
 from sealscope.recordings.channels import CHANNEL_UNITS

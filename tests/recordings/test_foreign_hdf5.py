@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sealscope.recordings import COUNTS, Recording, read
-from sealscope.recordings.oil import oil_temperature
+from sealscope.recordings.header import oil_temperature
 
 T = np.arange(200) / 500
 P = 2.5 + np.sin(4 * T)

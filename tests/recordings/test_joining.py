@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sealscope.recordings import Recording, inspect, join, read
-from sealscope.recordings.joining import start_seconds
+from sealscope.recordings.header import start_seconds
 
 from ..refusals import refusal
 

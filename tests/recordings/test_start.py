@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sealscope.recordings import read
-from sealscope.recordings.joining import file_seconds, start_seconds
+from sealscope.recordings.header import file_seconds, start_seconds
 from sealscope.recordings.recording import Recording
 
 

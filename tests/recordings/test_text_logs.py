@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from sealscope.errors import UnreadableFile
 from sealscope.recordings import COUNTS, inspect, read, split_map_option
 from sealscope.recordings.formats.headings.preamble import parse_remarks
-from sealscope.recordings.oil import oil_temperature
+from sealscope.recordings.header import oil_temperature
 
 from ..refusals import refusal
 

@@ -26,7 +26,7 @@ from sealscope.recordings.files import iter_columns
 from sealscope.recordings.formats.columns import GROUP, REST, reconstruct_map
 from sealscope.recordings.formats.headings.actuators import find_actuators
 from sealscope.recordings.formats.headings.labels import Label, proposed_map
-from sealscope.recordings.joining import start_seconds
+from sealscope.recordings.header import start_seconds
 from sealscope.recordings.recording import Array, Recording
 from sealscope.reporting.charts import display_values
 from sealscope.storage.atomic import atomic_write

@@ -51,7 +51,7 @@ from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.machine_sizes import AssumedMachine, states_rig
 from sealscope.errors import InputError, SealscopeError
 from sealscope.recordings.formats.columns import GROUP
-from sealscope.recordings.joining import file_seconds, start_seconds
+from sealscope.recordings.header import file_seconds, start_seconds
 from sealscope.recordings.mending import StatedLayout, mend, preview_text
 from sealscope.recordings.recording import Recording
 from sealscope.reporting.hold import hold_text, write_hold_page

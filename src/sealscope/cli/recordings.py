@@ -215,7 +215,7 @@ def _iter_dated_diagnoses(files: Sequence[Path], **options: Any) -> Iterator[Dat
 
 def _start_seconds(result: DiagnosedRecording) -> float | None:
     """Find the start of a recording [s since 1970] from its content or the file's name; None if unknown."""
-    from sealscope.recordings.joining import start_seconds
+    from sealscope.recordings.header import start_seconds
 
     return start_seconds(result.recording, Path(result.diagnosis.file).name)
 

@@ -48,7 +48,7 @@ def trend(
     from sealscope.diagnosis.trend.machine_trend import trend as trend_of
     from sealscope.diagnosis.trend.reading import estimate_reading, hold_reading
     from sealscope.diagnosis.verdict.diagnosis import find_machine_name
-    from sealscope.recordings.joining import file_seconds
+    from sealscope.recordings.header import file_seconds
     from sealscope.reporting.trend.page import write_trend_page
     from sealscope.reporting.trend.text import trend_csv, trend_text
     from sealscope.units import parse_quantity

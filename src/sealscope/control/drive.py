@@ -11,7 +11,7 @@ import numpy as np
 
 from sealscope.compiled import kernel, law, make_record, record_dtype
 from sealscope.errors import InputError
-from sealscope.parameters.circuit import check_circuit_property
+from sealscope.parameters.parts import check_circuit_property
 from sealscope.recordings.channels import Array
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from sealscope.control.controller import CompiledLaw, Controller, Measured, Star
 from sealscope.control.drive import DRIVE, Drive, check_numbers, drive_voltage
 from sealscope.control.leak_observer import OBSERVER, SHUT, Balance, make_observer, update_observer
 from sealscope.control.position import PositionPI
-from sealscope.parameters.circuit import check_circuit_property
+from sealscope.parameters.parts import check_circuit_property
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig

@@ -24,9 +24,17 @@ from sealscope.diagnosis.inference.equations.balances import (
     find_rest_limits,
     motions_of_side,
 )
-from sealscope.diagnosis.inference.equations.signals import Signals, interval_means
-from sealscope.diagnosis.inference.equations.terms import BIAS, CYLINDER, LAG, LEAK, MOTIONS, Equation
-from sealscope.diagnosis.inference.rows.weak_form import OVERLAP, weak_form_rows
+from sealscope.diagnosis.inference.equations.terms import (
+    BIAS,
+    CYLINDER,
+    LAG,
+    LEAK,
+    MOTIONS,
+    Equation,
+    Signals,
+    interval_means,
+)
+from sealscope.diagnosis.inference.rows import OVERLAP, weak_form_rows
 from sealscope.diagnosis.inspection import inspect_recording
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.priors.verdict import VERDICT
@@ -39,7 +47,7 @@ from sealscope.diagnosis.verdict.machine_sizes import (
     states_rig,
 )
 from sealscope.parameters import Rig, load_rig, rig_names
-from sealscope.parameters.circuit import ASYMMETRIC_CIRCUIT, OPEN_CIRCUIT
+from sealscope.parameters.parts import ASYMMETRIC_CIRCUIT, OPEN_CIRCUIT
 from sealscope.parameters.rig import ASSUMED
 from sealscope.recordings.channels import flow_source
 from sealscope.recordings.corrections.unsigned import is_two_way

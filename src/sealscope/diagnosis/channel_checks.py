@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sealscope.diagnosis.assumed_rig import assumed_rig
 from sealscope.diagnosis.flow_curves import FlowCurves
-from sealscope.diagnosis.inference.equations.signals import Signals
+from sealscope.diagnosis.inference.equations.terms import Signals
 from sealscope.diagnosis.inference.machine_states import find_rests
 from sealscope.diagnosis.inspection import inspect_recording
 from sealscope.parameters import Rig

@@ -1,7 +1,7 @@
 """Diagnose a recording: inspect the data, observe what changed, explain the changes, decide, and state one verdict.
 
 `inspection` checks the data, each detector that the channels allow reports its observations
-(`detectors.observation`), `decision` explains them and decides, and `Diagnosis` states the result.
+(`detectors.registry`), `decision` explains them and decides, and `Diagnosis` states the result.
 """
 
 from __future__ import annotations
@@ -17,10 +17,8 @@ import numpy as np
 from sealscope.calls import checked_call
 from sealscope.diagnosis.assumed_rig import assumed_rig
 from sealscope.diagnosis.decision.case import HealthyNull
-from sealscope.diagnosis.decision.decide import ORDER, combine, decide, is_decided, rank
-from sealscope.diagnosis.decision.reasons import text_of
-from sealscope.diagnosis.detectors.observation import healthy_null, limit_threads, observe_rivals, run_detector
-from sealscope.diagnosis.detectors.registry import detectors
+from sealscope.diagnosis.decision.decide import ORDER, combine, decide, is_decided, rank, text_of
+from sealscope.diagnosis.detectors.registry import detectors, healthy_null, limit_threads, observe_rivals, run_detector
 from sealscope.diagnosis.healthy import Healthy, SummarisedRecording
 from sealscope.diagnosis.hold.hold_test import judge_held_recording
 from sealscope.diagnosis.hold.recorded_holds import (

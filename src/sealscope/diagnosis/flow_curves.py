@@ -15,7 +15,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.assumed_rig import assumed_rig
-from sealscope.diagnosis.detectors.observation import limit_threads
+from sealscope.diagnosis.detectors.registry import limit_threads
 from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.estimate.linear import Gaussian
 from sealscope.diagnosis.inference.equations.balances import (
@@ -26,8 +26,7 @@ from sealscope.diagnosis.inference.equations.balances import (
     derive_drive_signals,
     find_rest_limits,
 )
-from sealscope.diagnosis.inference.equations.signals import Signals
-from sealscope.diagnosis.inference.equations.terms import START, Flow
+from sealscope.diagnosis.inference.equations.terms import START, Flow, Signals
 from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.inspection import inspect_recording
 from sealscope.parameters import Rig

@@ -3,7 +3,7 @@
 A healthy recording is given as samples, or as the summaries that were stored when the machine was commissioned.
 A detector summarises a healthy recording in a record (`Summary`), whose fields are the only statement of what is
 stored: they are written to a machine's file as a table (`table`), checked by their types when they are read
-(`commissioned.healthy_file`), and restored from it (`restore`).
+(`commissioned.machine_file`), and restored from it (`restore`).
 
 Detectors summarise a healthy recording, and its own changes are tested, each time that another recording is judged
 beside it. The results depend on the samples of the recording, the assumed rig and the sources of this package only:

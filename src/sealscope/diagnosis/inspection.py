@@ -19,7 +19,7 @@ from sealscope.paragraphs import join_names
 from sealscope.recordings.channels import CHANNEL_UNITS, SLOW, chambers_of
 from sealscope.recordings.corrections.samples import correct_samples
 from sealscope.recordings.formats.headings.labels import Label, find_name_and_unit, suggest_map_entry
-from sealscope.recordings.oil import oil_temperature
+from sealscope.recordings.header import oil_temperature
 from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.quality import (
     MISSING_CHANNEL,

@@ -8,7 +8,7 @@ from functools import cache
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
-from sealscope.diagnosis.inference.rows.row_weights import MAX_ITERATIONS, SUPPORT
+from sealscope.diagnosis.inference.rows import MAX_ITERATIONS, SUPPORT
 from sealscope.diagnosis.live.kernel.step import MAX_ONSETS
 from sealscope.diagnosis.live.kernel.stream import ADDED_A_CALL, HALVINGS, REASONS, WEIGHED_A_CALL, StreamSettings
 from sealscope.diagnosis.live.live_balance import BLOCK_SECONDS, LEARNED

@@ -13,7 +13,7 @@ import numpy as np
 from sealscope.calls import checked_call
 from sealscope.diagnosis.healthy import Healthy
 from sealscope.diagnosis.inference.equations.balances import PUMP_VOLUMES, absolute_offset
-from sealscope.diagnosis.inference.rows.row_weights import SUPPORT
+from sealscope.diagnosis.inference.rows import SUPPORT
 from sealscope.diagnosis.live.joining import SampleRun
 from sealscope.diagnosis.live.kernel.stream import RESULTS, StreamSettings
 from sealscope.diagnosis.live.live_balance import BLOCK_SECONDS, LiveBalance, NotJudged

@@ -25,7 +25,7 @@ from sealscope.fmu.description import format_build_description, format_descripti
 from sealscope.fmu.machine import FAILURES, RigChoice, rig_sources
 from sealscope.fmu.variables import INPUTS, REFERENCES, RESULTS, SENSOR_RESULTS, Variable, variables
 from sealscope.parameters import Rig, load_rig
-from sealscope.parameters.circuit import check_circuit_property
+from sealscope.parameters.parts import check_circuit_property
 from sealscope.physics.rig import parameter_values
 from sealscope.physics.state import STATES
 from sealscope.storage.atomic import atomic_write

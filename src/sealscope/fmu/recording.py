@@ -17,7 +17,7 @@ import numpy as np
 from sealscope.calls import checked_call, suggestion
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.fmu.variables import INPUTS
-from sealscope.parameters.instruments import Sensors
+from sealscope.parameters.parts import Sensors
 from sealscope.recordings.channels import CHANNEL_UNITS, Array
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import FILTER_REACH, Experiment

@@ -39,7 +39,7 @@ from sealscope.monitor.sources.source_block import TIME_UNITS, SourceBlock, coun
 from sealscope.monitor.sources.stream_recordings import StreamRecorder
 from sealscope.monitor.supervisor import Supervisor, describe_error
 from sealscope.monitor.verdicts import STREAM_SHARE, RecordingVerdict, judge_stream
-from sealscope.recordings.oil import measured_oil_temperature
+from sealscope.recordings.header import measured_oil_temperature
 from sealscope.recordings.recording import Recording
 from sealscope.storage.plain_state import require_part, restore, restore_attributes, save_attributes
 

@@ -6,8 +6,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sealscope.parameters.instruments import Daq as Daq
-    from sealscope.parameters.instruments import PressureTransducer as PressureTransducer
+    from sealscope.parameters.parts import Daq as Daq
+    from sealscope.parameters.parts import PressureTransducer as PressureTransducer
     from sealscope.parameters.rig import Rig as Rig
     from sealscope.parameters.rig import declared_names as declared_names
     from sealscope.parameters.rig import load_rig as load_rig
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from sealscope.parameters.rig import rig_names as rig_names
 
 _NAMES = {
-    "instruments": ("Daq", "PressureTransducer"),
+    "parts": ("Daq", "PressureTransducer"),
     "rig": ("Rig", "declared_names", "load_rig", "parse_overrides", "rig_names"),
 }
 

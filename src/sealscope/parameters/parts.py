@@ -1,12 +1,151 @@
-"""Parameters of a rig's parts: servo motor, pump, lines with throttles, fluid, cylinder, servo valve and its supply."""
+"""Parameters of a rig's parts: motor, pump, lines, fluid, cylinder, valve with its supply, sensors; and its circuit."""
 
 from __future__ import annotations
 
-from typing import Any, Literal, Self
+from collections.abc import Mapping
+from typing import Any, Literal, NamedTuple, Self
 
 from pydantic import model_validator
 
+from sealscope.errors import InputError
 from sealscope.parameters.fields import Part, choice, conductance, quantity, with_unit
+
+
+class HydraulicCircuit(NamedTuple):
+    """Connection of pump and cylinder chambers: one of `CIRCUITS`, chosen by a parameter of the rig (`Rig.circuit`).
+
+    Other modules read the properties below instead of comparing circuits. `CONTRIBUTING.md` says what a further circuit
+    needs.
+
+    Attributes
+    ----------
+    name : str
+        Name in messages.
+    parameter, value : str
+        Parameter that chooses the circuit, and its value.
+    required : mapping of str to str
+        Further parameters that must have a value in a rig with this circuit.
+    simulated : bool
+        A rig with this circuit can be simulated, by laws in `physics`; otherwise it can only be diagnosed.
+    valve_controlled : bool
+        A servo valve on a supply of constant pressure meters the flow into each chamber; else the pump's speed does.
+    pump_feeds_chambers : bool
+        The pump delivers into chamber A and draws from B, or the reverse. One balance of volumes then holds for both
+        chambers, but it cannot tell leakage of the pump from leakage past the piston. If the piston areas are equal,
+        the balance does not need the piston's position.
+    feeds_one_chamber : bool
+        The pump delivers into one chamber at a time, through directional valves, and the other drains to the tank.
+    has_asymmetric_pump : bool
+        The flows of the pump in the two lines have the ratio of the piston areas. The displacement is that of side A.
+    pump_is_measured : bool
+        An encoder on the pump's motor records its angle and speed.
+    holds_load : bool
+        Both chambers are shut while the command rests at zero, so that a load creeps by leakage alone.
+    flow_size : {"area", "displacement"}
+        The machine's size, piston area or pump displacement, to which flows in L/min from the balance of volumes are
+        proportional. Its uncertainty is in ``diagnosis/inference/priors.toml``, table ``[size]``, under the same name.
+    watched_by : tuple of tuple of str
+        Sets of channels from which the balance of volumes watches a running machine, the best set first.
+    needed_channels : str
+        Channels that the balance of volumes of a recording needs, in words for a message.
+    """
+
+    name: str
+    parameter: str
+    value: str
+    required: Mapping[str, str]
+    simulated: bool
+    valve_controlled: bool
+    pump_feeds_chambers: bool
+    feeds_one_chamber: bool
+    has_asymmetric_pump: bool
+    pump_is_measured: bool
+    holds_load: bool
+    flow_size: Literal["area", "displacement"]
+    watched_by: tuple[tuple[str, ...], ...]
+    needed_channels: str
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.parameter} = {self.value})"
+
+    @property
+    def pump_moves_piston(self) -> bool:
+        """True if the piston moves by the flow of the pump, which no valve meters: into both chambers, or into one."""
+        return self.pump_feeds_chambers or self.feeds_one_chamber
+
+    @property
+    def size_parameters(self) -> tuple[str, ...]:
+        """Dotted names of the parameters that scale flows of the volume balance: piston areas or displacement."""
+        return ("cylinder.A_A", "cylinder.A_B") if self.flow_size == "area" else ("pump.q_b",)
+
+
+#: A pump whose speed is commanded, in a closed circuit with the cylinder.
+PUMP_CIRCUIT = HydraulicCircuit(
+    name="pump-controlled",
+    parameter="valve.spool",
+    value="absent",
+    required={"supply.drive": "absent"},
+    simulated=True,
+    valve_controlled=False,
+    pump_feeds_chambers=True,
+    feeds_one_chamber=False,
+    has_asymmetric_pump=False,
+    pump_is_measured=True,
+    holds_load=False,
+    flow_size="displacement",
+    watched_by=(("p_A", "p_B", "x", "theta"), ("p_A", "p_B", "x", "omega")),
+    needed_channels="p_A, p_B and the pump's theta or omega, a flow meter q_pump or the command u",
+)
+#: A pump that draws from a tank. Directional valves lead its flow to one chamber at a time; the other drains.
+OPEN_CIRCUIT = PUMP_CIRCUIT._replace(
+    name="pump-controlled in an open circuit",
+    parameter="pump.circuit",
+    value="open",
+    required={"valve.spool": "absent", "supply.drive": "absent"},
+    simulated=False,
+    pump_feeds_chambers=False,
+    feeds_one_chamber=True,
+    needed_channels="x, p_A, p_B and the pump's theta or omega, or a flow meter q_pump",
+)
+#: A pump with a displacement for each piston area, or two pumps on one shaft, in a closed circuit with the cylinder.
+ASYMMETRIC_CIRCUIT = PUMP_CIRCUIT._replace(
+    name="pump-controlled by an asymmetric pump",
+    parameter="pump.circuit",
+    value="asymmetric",
+    required={"valve.spool": "absent", "supply.drive": "absent"},
+    simulated=False,
+    has_asymmetric_pump=True,
+)
+#: A servo valve between a supply and the cylinder.
+VALVE_CIRCUIT = HydraulicCircuit(
+    name="valve-controlled",
+    parameter="valve.spool",
+    value="present",
+    required={"supply.drive": "constant-speed", "line.orifices": "absent", "makeup.check_valves": "absent"},
+    simulated=True,
+    valve_controlled=True,
+    pump_feeds_chambers=False,
+    feeds_one_chamber=False,
+    has_asymmetric_pump=False,
+    pump_is_measured=False,
+    holds_load=True,
+    flow_size="area",
+    watched_by=(("p_A", "p_B", "p_1", "p_2", "u", "x"),),
+    needed_channels="x, u, p_A, p_B (for leaks in holds), and p_1 of the supply for motion",
+)
+#: All circuits. A rig has the first circuit whose `parameter` has its `value` in the rig. As the last two circuits
+#: cover all values of their parameter, a circuit that another parameter chooses must stand before them.
+CIRCUITS = (OPEN_CIRCUIT, ASYMMETRIC_CIRCUIT, PUMP_CIRCUIT, VALVE_CIRCUIT)
+
+
+def check_circuit_property(subject: str, rig: str, circuit: HydraulicCircuit, flag: str) -> None:
+    """Raise InputError unless a rig's `circuit` has the property `flag`, a bool attribute such as "pump_is_measured".
+
+    `subject`: what needs the property, such as "a simulation"; `rig`: the rig's name, for the message.
+    """
+    if not getattr(circuit, flag):
+        suitable = " or ".join(str(candidate) for candidate in CIRCUITS if getattr(candidate, flag))
+        raise InputError(f"{subject} must have a rig that is {suitable}, got {rig}, which is {circuit}")
 
 
 class Motor(Part):
@@ -243,3 +382,97 @@ class Supply(Part):
     V_acc: float = quantity("gas in the accumulator at p_pre (0: none)", "m^3", absent=0, ge=0, le=10)
     p_pre: float = quantity("pressure of the gas in the empty accumulator", "Pa", absent=5e6, ge=0, le=1e9)
     n_acc: float = quantity("polytropic exponent of the gas in the supply's accumulator", "1", absent=1, ge=1, le=2)
+
+
+class PressureTransducer(Part):
+    """A pressure transducer with the errors of its reading: noise, offset, drift, mains hum, delay and failures.
+
+    Its white noise `noise` is independent of that of other channels; `sensors.common_noise` is equal in all of them.
+    """
+
+    range_lo: float = quantity("lower end of the range", "Pa", ge=-1e9, le=1e9)
+    range_hi: float = quantity("upper end of the range", "Pa", gt=0, le=1e9)
+    noise: float = quantity("own white noise, standard deviation of a sample", "Pa", ge=0, le=1e8)
+    offset: float = quantity("zero offset", "Pa", ge=-1e8, le=1e8)
+    gain_error: float = quantity("relative gain error", "1", gt=-1, le=1)
+    drift: float = quantity("random walk of the zero, deviation per root second", "Pa/s^0.5", ge=0, le=1e8)
+    hum: float = quantity("amplitude of mains hum", "Pa", ge=0, le=1e8)
+    hum_frequency: float = quantity("frequency of mains hum", "Hz", gt=0, le=1e3)
+    stuck_rate: float = quantity("rate at which the reading gets stuck", "1/s", ge=0, le=1e3)
+    drop_rate: float = quantity("rate of lost samples", "1/s", ge=0, le=1e6)
+    delay: float = quantity("delay: the reading is the pressure of this time before", "s", ge=0, le=1)
+    lag: float = quantity("time constant of the transducer, first order", "s", absent=0, ge=0, le=10)
+    hum_harmonics: float = quantity(
+        "amplitude of each harmonic of the hum over the one before it", "1", absent=0, ge=0, le=1
+    )
+
+    @model_validator(mode="after")
+    def _check_range(self) -> Self:
+        """Raise ValueError, as pydantic requires, unless range_lo < range_hi."""
+        if self.range_lo >= self.range_hi:
+            raise ValueError(f"range_lo must be < range_hi = {with_unit(self.range_hi, 'Pa')}, got {self.range_lo}")
+        return self
+
+
+class PositionEncoder(Part):
+    """Encoder of the piston's position, with its resolution, noise and scale error."""
+
+    resolution: float = quantity("length of one count (0: no quantisation)", "m", ge=0, le=0.1)
+    noise: float = quantity("white noise before counting, standard deviation", "m", ge=0, le=0.1)
+    scale_error: float = quantity("relative error of the scale", "1", gt=-1, le=1)
+
+
+class AngleEncoder(Part):
+    """Encoder of the motor's angle."""
+
+    counts: int = quantity("counts per revolution", "count/rev", gt=0, le=100_000_000)
+
+
+class FlowMeter(Part):
+    """Flow meter in the bypass across the piston; it reads both directions."""
+
+    range_hi: float = quantity("largest flow read, either way", "m^3/s", gt=0, le=1)
+    resolution: float = quantity("smallest step of the reading (0: none)", "m^3/s", ge=0, le=1)
+    noise: float = quantity("white noise, standard deviation of a sample", "m^3/s", ge=0, le=1)
+
+
+class Sensors(Part):
+    """All sensors, by the names of their channels, and the noise that is common to the pressure channels."""
+
+    common_noise: float = quantity("white noise common to the pressure channels", "Pa", ge=0, le=1e8)
+    p_1: PressureTransducer
+    p_2: PressureTransducer
+    p_A: PressureTransducer
+    p_B: PressureTransducer
+    x: PositionEncoder
+    theta: AngleEncoder
+    q_leak: FlowMeter
+
+
+class Daq(Part):
+    """Data acquisition board; its inputs read `sensor_volts_lo` to `sensor_volts_hi` over a transducer's range."""
+
+    bits: int = quantity("resolution of the conversion", "bit", ge=2, le=32)
+    range: float = quantity("input range: plus and minus this voltage", "V", gt=0, le=1e3)
+    sample_rate: float = quantity("sampling rate", "Hz", gt=0, le=1e6)
+    jitter: float = quantity("jitter of the clock, standard deviation", "s", absent=0, ge=0, le=1e-3)
+    sensor_volts_lo: float = quantity("transducer output at range_lo", "V", ge=-1e3, le=1e3)
+    sensor_volts_hi: float = quantity("transducer output at range_hi", "V", ge=-1e3, le=1e3)
+    u_max: float = quantity("largest command: plus and minus this voltage", "V", gt=0, le=1e3)
+
+    @model_validator(mode="after")
+    def _check_output_volts(self) -> Self:
+        """Raise ValueError, as pydantic requires, unless -range <= sensor_volts_lo < sensor_volts_hi <= range."""
+        lo, hi = self.sensor_volts_lo, self.sensor_volts_hi
+        if lo >= hi:
+            raise ValueError(f"sensor_volts_lo must be < sensor_volts_hi = {with_unit(hi, 'V')}, got {lo}")
+        if hi > self.range:
+            raise ValueError(f"sensor_volts_hi must be <= range = {with_unit(self.range, 'V')}, got {hi}")
+        if lo < -self.range:
+            raise ValueError(f"sensor_volts_lo must be >= -range = {with_unit(-self.range, 'V')}, got {lo}")
+        return self
+
+    @property
+    def step(self) -> float:
+        """Voltage [V] of one step of the analog-digital conversion: 2 range / 2^bits."""
+        return 2.0 * self.range / 2.0**self.bits

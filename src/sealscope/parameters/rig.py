@@ -21,10 +21,22 @@ from pydantic.fields import FieldInfo
 
 from sealscope.calls import checked_call, suggestion
 from sealscope.errors import InputError
-from sealscope.parameters.circuit import CIRCUITS, HydraulicCircuit
 from sealscope.parameters.fields import Part, PartsDisagreeError, absent_of, choices_of, iter_fields, unit_of, with_unit
-from sealscope.parameters.instruments import Daq, Sensors
-from sealscope.parameters.parts import Cylinder, Fluid, Friction, HydraulicLine, MakeUp, Motor, Pump, ServoValve, Supply
+from sealscope.parameters.parts import (
+    CIRCUITS,
+    Cylinder,
+    Daq,
+    Fluid,
+    Friction,
+    HydraulicCircuit,
+    HydraulicLine,
+    MakeUp,
+    Motor,
+    Pump,
+    Sensors,
+    ServoValve,
+    Supply,
+)
 from sealscope.storage.atomic import atomic_write
 from sealscope.storage.opening import is_file_path
 from sealscope.storage.toml_file import read_toml

@@ -28,8 +28,8 @@ import numpy as np
 
 from sealscope.compiled import contracted, law
 from sealscope.parameters import Rig
-from sealscope.parameters.circuit import check_circuit_property
 from sealscope.parameters.fields import iter_fields, unit_of
+from sealscope.parameters.parts import check_circuit_property
 from sealscope.physics import cylinder, external, friction, motor, pump, restrictors, valve
 from sealscope.physics.fluid import effective_bulk_modulus, mixture_density_ratio, oil_density_ratio
 from sealscope.physics.lanes import select

@@ -1,65 +1,19 @@
-"""Find the start times of recordings, and join the files into which a logger cut one run."""
+"""Join the files into which a logger cut one run."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
-from numbers import Real
-from pathlib import Path
 
 import numpy as np
 
 from sealscope.calls import checked_call
 from sealscope.errors import InputError
-from sealscope.recordings.formats.times.timebase import counts_from_1970, parse_epoch, parse_name
+from sealscope.recordings.header import time_zero
 from sealscope.recordings.recording import Recording
 
-_DAY = 86400.0  # [s]
 _SAME_START = 1e-6  # starts that differ by less [s] are equal: the times then continue from file to file
-_MAX_SECONDS = 1e11  # start [s] beyond which times are in another unit than s: it would be in the year 5138
-
-
-def start_seconds(recording: Recording, file: str = "") -> float | None:
-    """Find the time of a recording's first sample [s since 1970]; None if it is not known.
-
-    The time of t = 0 is the entry `start_epoch_s` or `start` of the provenance. Without these entries it is the date in
-    the file's name: the entry `file` of the provenance, or the argument `file` if that entry is missing, too; so it is
-    if the entry `start` is that day without a time. Dates and times are taken as UTC; a date alone means midnight.
-    """
-    start, provenance = _time_zero(recording), recording.provenance
-    named_start = parse_name(str(provenance.get("file") or file), provenance.get("name_order"))
-    has_time = "T" in str(provenance.get("start", "T"))
-    if start is None or (not has_time and named_start is not None and 0.0 <= named_start - start < _DAY):
-        start = named_start
-    if start is None:
-        return None
-    known = np.flatnonzero(np.isfinite(recording.t))  # samples with a time, which the first may lack
-    first = float(recording.t[known[0]]) - int(known[0]) / recording.rate if known.size else 0.0
-    return start + first if abs(start + first) < _MAX_SECONDS else None
-
-
-def file_seconds(recording: Recording, path: Path) -> float:
-    """Find the time of a file's first sample [s since 1970].
-
-    If it is not known (`start_seconds`), it is the time of the file's last change minus the duration of the recording.
-    """
-    start = start_seconds(recording, path.name)
-    if start is not None:
-        return start
-    times = recording.t[np.isfinite(recording.t)]
-    return path.stat().st_mtime - (float(times[-1] - times[0]) if times.size else 0.0)
-
-
-def _time_zero(recording: Recording) -> float | None:
-    """Find the time of t = 0 [s since 1970] in the entry `start_epoch_s` or else `start` of the provenance, or None.
-
-    A `start_epoch_s` outside of March 1973 to the year 5138 (`counts_from_1970`) is ignored.
-    """
-    epoch = recording.provenance.get("start_epoch_s")
-    if isinstance(epoch, Real) and counts_from_1970(float(epoch)):
-        return float(epoch)
-    return parse_epoch(str(recording.provenance.get("start", "")))
 
 
 def _check_compatible(recordings: Sequence[Recording], names: Sequence[str]) -> None:
@@ -116,7 +70,7 @@ def join(recordings: Sequence[Recording], *, names: Sequence[str] | None = None)
         str(recording.provenance.get("file", f"recording {k}")) for k, recording in enumerate(recordings, 1)
     ]
     _check_compatible(recordings, names)
-    starts = [_time_zero(recording) for recording in recordings]
+    starts = [time_zero(recording) for recording in recordings]
     known_starts = [start for start in starts if start is not None]
     is_dated = len(known_starts) == len(starts) and max(known_starts) - min(known_starts) > _SAME_START
     # all times relative to the earliest start

@@ -19,7 +19,7 @@ import sealscope as ss
 from sealscope.diagnosis.commissioned.machine import JudgedAlarm
 from sealscope.diagnosis.commissioned.machine_file import parse_moment
 from sealscope.diagnosis.commissioned.summary import MachineSummary, summarise_machine
-from sealscope.diagnosis.detectors.observation import comparable_summaries, compare_healthy
+from sealscope.diagnosis.detectors.registry import comparable_summaries, compare_healthy
 from sealscope.diagnosis.healthy import SummarisedRecording
 from sealscope.errors import InputError
 from sealscope.recordings.channels import CHANNEL_UNITS

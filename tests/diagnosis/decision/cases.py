@@ -8,7 +8,7 @@ import numpy as np
 
 from sealscope.diagnosis.estimate.change import Information, StepTest, step_test
 from sealscope.diagnosis.estimate.interval import Estimate, Interval
-from sealscope.diagnosis.inference.comparison.levels import Rise
+from sealscope.diagnosis.inference.comparison import Rise
 from sealscope.diagnosis.inference.observable import LeakMeasure, LeakRise, Observable
 from sealscope.diagnosis.verdict.evidence import TotalLeakage
 

@@ -13,7 +13,7 @@ import pytest
 from sealscope.diagnosis.decision.case import AGAINST, LEVEL, WITHIN, Case, HealthyNull
 from sealscope.diagnosis.decision.decide import decide
 from sealscope.diagnosis.estimate.interval import Interval
-from sealscope.diagnosis.inference.comparison.levels import Rise
+from sealscope.diagnosis.inference.comparison import Rise
 from sealscope.diagnosis.inference.observable import LeakMeasure, Observable, Observed
 from sealscope.diagnosis.verdict.evidence import Evidence
 
@@ -193,7 +193,6 @@ DECISION = {"verdict/evidence.py", "decision/decide.py", "decision/case.py"}
 #: "leak" as the name of a term, a column, a table of texts or a prior.
 NAMES = {
     "decision/decide.py",
-    "decision/reasons.py",
     "inference/block_stream.py",
     "inference/blocks.py",
     "inference/comparison/recording_sums.py",

@@ -26,7 +26,7 @@ from sealscope.diagnosis.inference.delays import DELAYED
 from sealscope.diagnosis.inference.equations.balances import circulation, equations, locked
 from sealscope.diagnosis.inference.equations.terms import AIR, BIAS, TURNING, delay_name
 from sealscope.diagnosis.inference.pressures.reduced_rig import PARAMETERS
-from sealscope.diagnosis.inference.volumes.rivals import TURNING_DATA
+from sealscope.diagnosis.inference.volumes.volume_detector import TURNING_DATA
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.diagnosis.rms_change.rms_detector import JUDGED
 from sealscope.parameters import load_rig

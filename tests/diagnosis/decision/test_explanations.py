@@ -19,7 +19,7 @@ from sealscope.diagnosis.decision.explanations import (
     probability_of,
 )
 from sealscope.diagnosis.estimate.interval import Estimate
-from sealscope.diagnosis.inference.comparison.levels import Rise
+from sealscope.diagnosis.inference.comparison import Rise
 from sealscope.diagnosis.inference.observable import LeakRise, Observable, Observed
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.severity import state_of

@@ -25,7 +25,7 @@ from pydantic import AfterValidator, BeforeValidator, ConfigDict, FailFast, Fiel
 from sealscope.diagnosis.healthy import Magnitude, Number, Positive, SummarisedRecording, Summary, Time
 from sealscope.diagnosis.hold.recorded_holds import HoldSummary
 from sealscope.diagnosis.inference.changes.healthy_levels import LevelSummary
-from sealscope.diagnosis.inference.comparison.recording_sums import BalanceSummary
+from sealscope.diagnosis.inference.comparison import BalanceSummary
 from sealscope.diagnosis.inference.pressures.samples import ResponseSummary
 from sealscope.diagnosis.rms_change.rms_detector import DetailSummary
 from sealscope.errors import InputError

@@ -18,8 +18,13 @@ import numpy as np
 from sealscope.calls import checked_call
 from sealscope.diagnosis.assumed_rig import assumed_rig, infer_rig
 from sealscope.diagnosis.commissioned.summary import cross_check
-from sealscope.diagnosis.detectors.observation import limit_threads, stored_surprisals
-from sealscope.diagnosis.detectors.registry import detectors, log_failure, unusable_reason
+from sealscope.diagnosis.detectors.registry import (
+    detectors,
+    limit_threads,
+    log_failure,
+    stored_surprisals,
+    unusable_reason,
+)
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY, diagnose
 from sealscope.diagnosis.healthy import SummarisedRecording, summary_table
 from sealscope.diagnosis.hold.hold_test import judge_held_recording
@@ -40,7 +45,7 @@ from sealscope.parameters import Rig, load_rig
 from sealscope.recordings import read
 from sealscope.recordings.files import read_file
 from sealscope.recordings.formats.columns import GROUP, REST, ChannelMap, Request, as_mapping
-from sealscope.recordings.joining import start_seconds
+from sealscope.recordings.header import start_seconds
 from sealscope.recordings.recording import Recording
 from sealscope.storage.folders import iter_inner_files
 

@@ -18,9 +18,9 @@ import numpy as np
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY
 from sealscope.diagnosis.healthy import SummarisedRecording
 from sealscope.diagnosis.hold.recorded_holds import HoldSummary
-from sealscope.diagnosis.inference.comparison.recording_sums import BalanceSummary
+from sealscope.diagnosis.inference.comparison import BalanceSummary
 from sealscope.diagnosis.inference.equations.balances import circulation, equations
-from sealscope.diagnosis.inference.equations.signals import Signals
+from sealscope.diagnosis.inference.equations.terms import Signals
 from sealscope.diagnosis.inference.machine_states import find_rests
 from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.inspection import Inspection
@@ -31,7 +31,7 @@ from sealscope.diagnosis.verdict.machine_sizes import unstated_rig
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.paragraphs import paragraphs
 from sealscope.recordings.channels import estimate_quantum
-from sealscope.recordings.oil import oil_temperature
+from sealscope.recordings.header import oil_temperature
 from sealscope.recordings.recording import Array, Recording
 from sealscope.units import BAR, LITRE_PER_MINUTE, P_ATM, from_si
 

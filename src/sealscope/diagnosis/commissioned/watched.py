@@ -12,7 +12,7 @@ from sealscope.diagnosis.commissioned.machine_file import read_machine
 from sealscope.diagnosis.estimate.linear import Gaussian
 from sealscope.diagnosis.healthy import SummarisedRecording
 from sealscope.diagnosis.inference.blocks import ColumnRoles
-from sealscope.diagnosis.inference.comparison.recording_sums import BalanceSummary
+from sealscope.diagnosis.inference.comparison import BalanceSummary
 from sealscope.diagnosis.inference.equations.balances import equations
 from sealscope.diagnosis.inference.equations.terms import PUMP
 from sealscope.diagnosis.live.estimates import HealthyLevel

@@ -38,7 +38,7 @@ from sealscope.diagnosis.decision.explanations import (
 )
 from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.estimate.population import weigh_alternatives
-from sealscope.diagnosis.inference.comparison.levels import RISE
+from sealscope.diagnosis.inference.comparison import RISE
 from sealscope.diagnosis.inference.observable import LeakMeasure, Observable, Observed
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.evidence import AGAINST, WITHIN
@@ -360,8 +360,8 @@ def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
 
     The p-value (`chance`) of each test is compared with the test's part of the probability. The p-value of a step is
     `StepTest.chance` (`estimate/change.py`). In the volume balance it was divided by the prior probability of the
-    leak's law (`find_leak_step` of `inference/leak_law.py`). It is calibrated (`HealthyNull`) by the p-values that the
-    same test gave in healthy recordings (`healthy_null` of `detectors/observation.py`). The p-value of a rise is
+    leak's law (`find_leak_step` of `inference/leak_flow.py`). It is calibrated (`HealthyNull`) by the p-values that the
+    same test gave in healthy recordings (`healthy_null` of `detectors/registry.py`). The p-value of a rise is
     `Rise.chance`, which rests on healthy recordings already; that of a level follows from the normal distribution.
     """
     from scipy.special import ndtr, ndtri  # standard normal distribution and its inverse

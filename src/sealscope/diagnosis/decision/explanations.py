@@ -31,7 +31,7 @@ import numpy as np
 
 from sealscope.diagnosis.estimate.population import weigh_alternatives
 from sealscope.diagnosis.inference.changes.volumes import VOLUMES
-from sealscope.diagnosis.inference.comparison.levels import RISE
+from sealscope.diagnosis.inference.comparison import RISE
 from sealscope.diagnosis.inference.hypotheses import temper
 from sealscope.diagnosis.inference.observable import LeakRise, Observable
 from sealscope.diagnosis.priors.decision import DECISION

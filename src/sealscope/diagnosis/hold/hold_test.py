@@ -23,7 +23,7 @@ from sealscope.diagnosis.priors.hold import HOLD
 from sealscope.errors import InputError
 from sealscope.paragraphs import join_names
 from sealscope.recordings.channels import CHAMBERS, COUNTS, FLOW_SOURCES
-from sealscope.recordings.joining import start_seconds
+from sealscope.recordings.header import start_seconds
 from sealscope.recordings.motion import is_constant
 from sealscope.recordings.quality import Finding, inspect
 from sealscope.recordings.recording import Array, Recording

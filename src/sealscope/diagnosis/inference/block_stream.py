@@ -27,8 +27,7 @@ from sealscope.diagnosis.inference.equations.balances import (
     without_flow,
     without_lowering,
 )
-from sealscope.diagnosis.inference.equations.signals import HALF_DIFFERENCE, Signals
-from sealscope.diagnosis.inference.equations.terms import MOVING_BIAS, Equation
+from sealscope.diagnosis.inference.equations.terms import HALF_DIFFERENCE, MOVING_BIAS, Equation, Signals
 from sealscope.diagnosis.inference.machine_states import (
     AVERAGING_TIME,
     LOWERING_MARGIN,
@@ -38,14 +37,20 @@ from sealscope.diagnosis.inference.machine_states import (
     extend_flags,
     find_lowering_limits,
 )
-from sealscope.diagnosis.inference.rows import flow_sign
-from sealscope.diagnosis.inference.rows.row_weights import SUPPORT
-from sealscope.diagnosis.inference.rows.weak_form import (
+from sealscope.diagnosis.inference.rows import (
+    MOTION_SCORE,
+    N_LOAD_SUMS,
+    N_MOTION_SUMS,
     SPAN,
+    SUPPORT,
+    add_rows,
+    leak_score,
     stride_samples,
     strides_in,
+    sum_log_odds,
     weak_form_rows,
     weights_near_holes,
+    z_score,
 )
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.corrections.unsigned import UNSIGNED, is_one_sided, is_two_way, restore_flow
@@ -419,7 +424,7 @@ class SignEvidence(SavedAttributes):
     """Evidence on the sign of the recorded flow of each volume balance, from sums over the rows of all blocks so far.
 
     The flow is the left side of the balance, in a valve's chamber the volume -A dx (`Equation.flow_sign` -1). The
-    symptoms are those of `rows.flow_sign`; in a valve's chamber the position is no evidence.
+    symptoms are those of `rows`; in a valve's chamber the position is no evidence.
     """
 
     SAVED = ("_grams", "_counts", "_motions", "_loads")
@@ -427,11 +432,11 @@ class SignEvidence(SavedAttributes):
     def __init__(self, balances: Sequence[Equation], columns: Sequence[ColumnRoles]) -> None:
         self._balances, self._columns = balances, columns
         # for each balance: Gram matrix and number of the rows; sums of the products of flow and motion, and of their
-        # squares, by the columns of `_motion_columns`; sums of `flow_sign.add_load` by p_A - p_B and the force
+        # squares, by the columns of `_motion_columns`; sums of `add_load` by p_A - p_B and the force
         self._grams = [np.zeros((roles.left + 1, roles.left + 1)) for roles in columns]
         self._counts = np.zeros(len(balances))
-        self._motions = [np.zeros((len(_motion_columns(roles)), flow_sign.N_MOTION_SUMS)) for roles in columns]
-        self._loads = np.zeros((len(balances), 2, flow_sign.N_LOAD_SUMS))
+        self._motions = [np.zeros((len(_motion_columns(roles)), N_MOTION_SUMS)) for roles in columns]
+        self._loads = np.zeros((len(balances), 2, N_LOAD_SUMS))
 
     def add(self, rows: Sequence[Array]) -> None:
         """Add the rows (r, m) of the regression of each balance."""
@@ -441,7 +446,7 @@ class SignEvidence(SavedAttributes):
             motions = [values[:, indices].sum(axis=1) for indices in _motion_columns(roles)]
             loads = [_load_pressure(values, roles, area_ratio) for area_ratio in (1.0, balance.area_ratio)]
             flow = balance.flow_sign * values[:, roles.left]  # into A
-            flow_sign.add_rows(
+            add_rows(
                 self._motions[e], self._loads[e], np.reshape(motions, (len(motions), len(flow))), np.array(loads), flow
             )
 
@@ -452,17 +457,17 @@ class SignEvidence(SavedAttributes):
         for roles, gram, count, motions, loads in zip(
             self._columns, self._grams, self._counts, self._motions, self._loads, strict=True
         ):
-            motion_z = flow_sign.z_score(*motions[0].tolist()) if roles.piston else 0.0
+            motion_z = z_score(*motions[0].tolist()) if roles.piston else 0.0
             leak_z = _leak_z_score(gram, roles, int(count))
             difference_sums, force_sums = loads.tolist()
-            odds_by_balance.append(flow_sign.sum_log_odds(leak_z, difference_sums, force_sums, motion_z))
+            odds_by_balance.append(sum_log_odds(leak_z, difference_sums, force_sums, motion_z))
         return tuple(odds_by_balance)
 
     @property
     def shows_motion(self) -> bool:
         """True if flow and motion correlate by `sense.motion_score` (`priors.toml`) standard errors, either way."""
-        z_scores = [abs(flow_sign.z_score(*sums)) for motions in self._motions for sums in motions.tolist()]
-        return not z_scores or max(z_scores) > flow_sign.MOTION_SCORE
+        z_scores = [abs(z_score(*sums)) for motions in self._motions for sums in motions.tolist()]
+        return not z_scores or max(z_scores) > MOTION_SCORE
 
 
 def _motion_columns(roles: ColumnRoles) -> list[list[int]]:
@@ -486,7 +491,7 @@ def _load_pressure(rows: Array, columns: ColumnRoles, area_ratio: float) -> Arra
 
 
 def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
-    """Compute the z score of the leak's coefficient (`flow_sign`); `gram` (m, m): of the `n_rows` rows."""
+    """Compute the z score of the leak's coefficient (`sum_log_odds`); `gram` (m, m): of the `n_rows` rows."""
     nuisance = [k for k in roles.nuisance if k != roles.leak]
     leak = Gaussian.from_gram(gram).marginal([roles.leak], nuisance)
     energy, moment, whole_energy = (
@@ -495,4 +500,4 @@ def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
         float(gram[roles.leak, roles.leak]),
     )
     freedom = float(n_rows - len(nuisance) - 1)
-    return flow_sign.leak_score(energy, moment, leak.square, whole_energy, freedom)
+    return leak_score(energy, moment, leak.square, whole_energy, freedom)

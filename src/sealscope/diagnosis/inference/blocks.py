@@ -1,10 +1,10 @@
 """Likelihood of a volume balance's coefficients in blocks of a recording, from sums over the rows of each block.
 
 A volume balance (`terms`) is linear: its left side is a sum of terms, each a coefficient times a column of data. A row
-is the balance integrated with one test function of the weak form (`rows.weak_form`). A block is a few seconds of a
+is the balance integrated with one test function of the weak form (`rows`). A block is a few seconds of a
 recording, of which only the Gram matrix of its rows over all columns (terms and left side) is stored. Gram matrices of
 several blocks add up, so that a stream and a recording of hours are handled alike. Rows are weighted once, when their
-block is closed (`row_weights`).
+block is closed (`rows`).
 
 All samples of the balance's channels count, also those that bridge a short gap. A row with a clipped sample does not
 count, and one beside a long gap by its share outside of the gap (`block_stream.BlockStream`).
@@ -29,13 +29,14 @@ from sealscope.compiled import kernel, law
 from sealscope.diagnosis.estimate.change import History, Information
 from sealscope.diagnosis.estimate.linear import MAX_PRIOR, RIDGE, Gaussian, solve, solve_in_place
 from sealscope.diagnosis.inference.equations.terms import BIAS, HOLDING, LAG, LEAK, MOVING_BIAS, TURNING, Equation
-from sealscope.diagnosis.inference.rows.row_weights import (
+from sealscope.diagnosis.inference.rows import (
     MAX_ITERATIONS,
+    OVERLAP,
     SUPPORT,
     TOLERANCE,
     block_gram_matrices,
+    stride_samples,
 )
-from sealscope.diagnosis.inference.rows.weak_form import OVERLAP, stride_samples
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
@@ -811,7 +812,7 @@ def offset_penalty(offset: float) -> float:
     """Compute how improbable a sensor offset of p_A - p_B [Pa] is: -2 log of its density over the largest one.
 
     Of a sensor that is far off, the largest density is that of such sensors, times their odds. Penalties of sizes of
-    other changes (`StepSize.penalty`), with which it is compared, are relative to their largest density as well.
+    other changes (`observable.step_penalty`), with which it is compared, are relative to their largest density as well.
     """
     usual, far, odds = INFERENCE.zero.pressure, INFERENCE.zero.far, INFERENCE.zero.odds
     return float(min((offset / usual) ** 2, (offset / far) ** 2 - 2.0 * np.log(odds)))

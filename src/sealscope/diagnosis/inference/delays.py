@@ -30,7 +30,8 @@ from sealscope.diagnosis.estimate.linear import Gaussian, solve
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, information
 from sealscope.diagnosis.inference.equations.terms import LAG, ORIFICE, delay_name
 from sealscope.diagnosis.inference.hypotheses import compare_residuals
-from sealscope.diagnosis.inference.rows.weak_form import half_width
+from sealscope.diagnosis.inference.observable import step_penalty
+from sealscope.diagnosis.inference.rows import half_width
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 
@@ -228,7 +229,7 @@ def _change_log_odds(test: StepTest, change: Estimate) -> float:
     """
     prior = INFERENCE.delay
     size = max(abs(change.value), np.finfo(float).tiny)
-    log_density = -0.5 * prior.penalty(size) - np.log(2.0 * np.sqrt(2.0 * np.pi) * prior.spread * size)
+    log_density = -0.5 * step_penalty(size, prior) - np.log(2.0 * np.sqrt(2.0 * np.pi) * prior.spread * size)
     log_mean = float(np.log(np.mean(np.exp(test.likelihood - test.likelihood.max()))))
     log_occam = float(np.log(np.sqrt(2.0 * np.pi) * max(change.deviation, np.finfo(float).tiny)) + log_density)
     return float(np.log(prior.odds)) + 0.5 * test.score + log_mean + min(log_occam, 0.0)

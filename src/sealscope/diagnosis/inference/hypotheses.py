@@ -3,12 +3,12 @@
 | unknown | alternatives | prior (`priors.toml`) | evidence of a recording | here |
 | --- | --- | --- | --- | --- |
 | valves at rest | `Valves` | `rest.shut_odds` | `regimes.shut_odds` | `VALVES` |
-| sign of the recorded flow | right, reversed | equal | `rows.flow_sign` | `FLOW_SIGN` |
+| sign of the recorded flow | right, reversed | equal | `sum_log_odds` | `FLOW_SIGN` |
 | held load without a flow | creeps by leakage, a loop holds it | equal | `RecordedBalance.creep_log_odds` | `CREEP` |
 | flow at rest | circulates, holds the load | `feed.circulation_odds` | `balances.flag_circulation` | `HoldCounts` |
 | chambers that a pump feeds | both, one at a time, each by its displacement | `feed` | `FeedSums.find_feed` | |
 | zero of p_A - p_B | near 0, any | `zero` | `pressure_offset` | |
-| law of a leak | exponent of its flow | `size.laminar` | `leak_law`, `comparison.levels` | `LAWS` |
+| law of a leak | exponent of its flow | `size.laminar` | `leak_flow`, `comparison` | `LAWS` |
 | course of a leak | growth from its onset to the end | `growth` | `leak_flow`, `HeldChambers` | `GROWTHS` |
 
 The first four are the same in all recordings of a machine, so their log odds add up: those of the healthy recordings,
@@ -144,7 +144,7 @@ class MachineOdds(NamedTuple):
     """Odds of a machine's unknowns before a recording of it is seen; by default those without healthy recordings.
 
     - `valves`: log odds that valves cut a resting pump off, infinite if the healthy recordings leave no doubt;
-    - `flow_sign` (E,): log odds of each balance that the recorded flow has the right sign;
+    - `rows` (E,): log odds of each balance that the recorded flow has the right sign;
     - `creep`: log odds that a held load creeps by leakage, rather than that a control loop holds it;
     - `holds`: holds of an open circuit, None if none is known.
     """

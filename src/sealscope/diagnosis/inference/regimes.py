@@ -56,7 +56,6 @@ from sealscope.diagnosis.inference.equations.balances import (
     without_flow,
     without_lowering,
 )
-from sealscope.diagnosis.inference.equations.signals import Signals
 from sealscope.diagnosis.inference.equations.terms import (
     BIAS,
     HOLDING,
@@ -66,6 +65,7 @@ from sealscope.diagnosis.inference.equations.terms import (
     TURNING,
     Equation,
     Flow,
+    Signals,
 )
 from sealscope.diagnosis.inference.hypotheses import HoldCounts, Valves
 from sealscope.diagnosis.inference.pressure_offset import (

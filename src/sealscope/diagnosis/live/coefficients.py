@@ -20,8 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sealscope.compiled import large_law, law
-from sealscope.diagnosis.inference.rows.row_weights import eliminate
-from sealscope.diagnosis.inference.rows.weak_form import OVERLAP
+from sealscope.diagnosis.inference.rows import OVERLAP, eliminate
 from sealscope.diagnosis.priors.live import LIVE
 
 #: Standard deviations beyond which a residual is a glitch or a step; fraction of the usual motion at a standstill.

@@ -12,7 +12,7 @@ import numpy as np
 
 from sealscope.diagnosis.estimate.interval import WITHIN_95, Estimate
 from sealscope.diagnosis.estimate.interval import Interval as EstimatedInterval
-from sealscope.diagnosis.inference.comparison.levels import Rise
+from sealscope.diagnosis.inference.comparison import Rise
 from sealscope.diagnosis.live.sequential import LEVEL, LiveRise
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.priors.live import LIVE

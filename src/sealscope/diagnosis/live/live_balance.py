@@ -26,7 +26,7 @@ from sealscope.diagnosis.inference.equations.terms import PUMP, STATES, Equation
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.pressure_offset import remove_pressure_offset
 from sealscope.diagnosis.inference.regimes import NEGLIGIBLE
-from sealscope.diagnosis.inference.rows.weak_form import stride_samples
+from sealscope.diagnosis.inference.rows import stride_samples
 from sealscope.diagnosis.live.coefficients import (
     MIN_REST_PRECISION,
     MISFIT,

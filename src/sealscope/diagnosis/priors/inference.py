@@ -1,8 +1,5 @@
 """Typed tables of `inference/priors.toml`: assumptions on the terms of a volume balance."""
 
-import math
-import sys
-
 from sealscope.storage.toml_file import PriorTable, read_priors
 
 
@@ -141,15 +138,6 @@ class StepSize(PriorTable):
 
     size: float
     spread: float
-
-    def penalty(self, step: float, above: bool = False) -> float:
-        """Compute the penalty -2 log(prior density / largest prior density) for an improbable size of a step.
-
-        The prior is normal in log(abs(`step`)) about log(`size`), with the standard deviation `spread`. With `above`,
-        only steps larger than `size` are penalised.
-        """
-        deviation = math.log(max(abs(step), sys.float_info.min) / self.size) / self.spread
-        return max(deviation, 0.0) ** 2 if above else deviation**2
 
 
 class DelayPriors(StepSize):

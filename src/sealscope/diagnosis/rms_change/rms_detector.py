@@ -43,13 +43,13 @@ from sealscope.diagnosis.healthy import (
     Values,
     healthy_summaries,
 )
-from sealscope.diagnosis.inference.comparison.levels import Rise, rise_of_mixture
+from sealscope.diagnosis.inference.comparison import Rise, rise_of_mixture
 from sealscope.diagnosis.inference.observable import Observable, Observed, Ringing
 from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
 from sealscope.diagnosis.verdict.evidence import RMS_CHANGE
 from sealscope.recordings.channels import CHAMBERS, ROUNDING, chambers_of
 from sealscope.recordings.corrections.gaps import flag_bridged
-from sealscope.recordings.joining import start_seconds
+from sealscope.recordings.header import start_seconds
 from sealscope.recordings.motion import find_cycle, is_constant
 from sealscope.recordings.quality import describe_missing_chambers, is_mostly_clipped
 from sealscope.recordings.recording import Array, Recording

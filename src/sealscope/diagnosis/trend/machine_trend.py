@@ -25,12 +25,11 @@ from sealscope.diagnosis.decision.decide import decide
 from sealscope.diagnosis.estimate.interval import WITHIN_95, Interval
 from sealscope.diagnosis.hold.recorded_holds import SEPARATE_LEAKS
 from sealscope.diagnosis.hold.result import HoldResult
-from sealscope.diagnosis.inference.comparison.levels import Rise
-from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
+from sealscope.diagnosis.inference.comparison import RecordingSums, Rise
 from sealscope.diagnosis.inference.hypotheses import LAWS
-from sealscope.diagnosis.inference.leak_law import mixture_flow
+from sealscope.diagnosis.inference.leak_flow import mixture_flow
 from sealscope.diagnosis.inference.observable import LeakMeasure, LeakRise, Observable, Observed, Ringing
-from sealscope.diagnosis.inference.volumes.rivals import rival_rises
+from sealscope.diagnosis.inference.volumes.volume_detector import rival_rises
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.rms_change.rms_detector import DETAILS, compare_summaries, has_same_rate
 from sealscope.diagnosis.trend.reading import (

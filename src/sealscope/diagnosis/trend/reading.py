@@ -13,15 +13,14 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from sealscope.diagnosis.assumed_rig import assumed_rig
-from sealscope.diagnosis.detectors.observation import limit_threads
-from sealscope.diagnosis.detectors.registry import unusable_reason
+from sealscope.diagnosis.detectors.registry import limit_threads, unusable_reason
 from sealscope.diagnosis.estimate.interval import WITHIN_95
 from sealscope.diagnosis.healthy import healthy_summaries
 from sealscope.diagnosis.hold.hold_test import judge_held_recording
 from sealscope.diagnosis.hold.recorded_holds import date_hold, held_leakage
 from sealscope.diagnosis.hold.result import HoldResult
 from sealscope.diagnosis.inference.blocks import ColumnRoles
-from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
+from sealscope.diagnosis.inference.comparison import RecordingSums
 from sealscope.diagnosis.inference.equations.terms import Flow
 from sealscope.diagnosis.inference.pressures.leak import conductance_scale_error
 from sealscope.diagnosis.inference.pressures.response_detector import PressureResponse
@@ -37,8 +36,7 @@ from sealscope.errors import InputError
 from sealscope.paragraphs import join_names
 from sealscope.parameters import Rig
 from sealscope.recordings.channels import CHAMBERS, chambers_of
-from sealscope.recordings.joining import start_seconds
-from sealscope.recordings.oil import oil_temperature
+from sealscope.recordings.header import oil_temperature, start_seconds
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
 from sealscope.signals.details import QUANTITIES

@@ -33,8 +33,7 @@ from sealscope.monitor.supervisor import DATABASE, PartAway, SupervisedPart, des
 from sealscope.monitor.verdicts import judge_hold_results, judge_recording
 from sealscope.recordings import Recording
 from sealscope.recordings.corrections.samples import correct_samples, remove_holes
-from sealscope.recordings.joining import file_seconds
-from sealscope.recordings.oil import oil_temperature
+from sealscope.recordings.header import file_seconds, oil_temperature
 from sealscope.units import DAY
 
 _log = logging.getLogger(__name__)

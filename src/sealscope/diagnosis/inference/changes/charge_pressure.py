@@ -36,7 +36,7 @@ from sealscope.diagnosis.inference.changes.motion_fit import (
     stack_equations,
 )
 from sealscope.diagnosis.inference.machine_states import find_rests
-from sealscope.diagnosis.inference.observable import Observable, compare_estimates
+from sealscope.diagnosis.inference.observable import Observable, compare_estimates, step_penalty
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.channels import flow_source
 from sealscope.recordings.recording import Array, Recording, compute_once
@@ -248,7 +248,7 @@ def compare_low_drifts(
     for side, drift in drifts.items():
         change = compare_estimates(LOW.format(side), DRIFT, drift, known[side], scatter)
         if change is not None:
-            yield replace(change, advantage=-CHANGES.zero_drift.penalty(change.size))
+            yield replace(change, advantage=-step_penalty(change.size, CHANGES.zero_drift))
     # of each side's drift: prior variance between days, squared standard error, variance between healthy recordings
     healthy_var = {side: float(np.var([drift.value for drift in known[side]])) for side in drifts}
     variances = {side: prior.scatter**2 + drift.deviation**2 + healthy_var[side] for side, drift in drifts.items()}
@@ -263,7 +263,7 @@ def compare_low_drifts(
         difference = compare_estimates(FALL, DRIFT, subtract_drifts(judged), differences, scatter)
         chance = 1.0 if difference is None else min(1.0, fall.chance / max(difference.chance, TINY))
         fall = replace(fall, chance=chance)
-    yield replace(fall, advantage=-CHANGES.charge_fall.penalty(fall.size))
+    yield replace(fall, advantage=-step_penalty(fall.size, CHANGES.charge_fall))
 
 
 def _mean_fall(drifts: Mapping[str, Estimate], variances: Mapping[str, float]) -> Estimate | None:

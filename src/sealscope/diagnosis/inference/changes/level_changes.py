@@ -37,7 +37,7 @@ import numpy as np
 
 from sealscope.diagnosis.estimate.change import MIN_BLOCKS, RANK_TOLERANCE, Information, step_tests_of_columns
 from sealscope.diagnosis.estimate.interval import Estimate, Interval
-from sealscope.diagnosis.inference.equations.signals import HALF_DIFFERENCE, central_difference
+from sealscope.diagnosis.inference.equations.terms import HALF_DIFFERENCE, central_difference
 from sealscope.diagnosis.inference.hypotheses import temper
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.priors.changes import CHANGES

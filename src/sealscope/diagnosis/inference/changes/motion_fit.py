@@ -26,7 +26,7 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 from sealscope.compiled import kernel
 from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.inference.changes.level_changes import find_motion_channel
-from sealscope.diagnosis.inference.comparison.recording_sums import Resistance
+from sealscope.diagnosis.inference.comparison import Resistance
 from sealscope.diagnosis.inference.machine_states import AVERAGING_TIME, number_strokes, rest_limit
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.channels import CHAMBERS

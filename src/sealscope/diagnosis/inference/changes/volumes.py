@@ -39,8 +39,8 @@ from sealscope.diagnosis.inference.equations.terms import (
     delay_name,
 )
 from sealscope.diagnosis.inference.hypotheses import LAWS
-from sealscope.diagnosis.inference.leak_law import apparent_conductances
-from sealscope.diagnosis.inference.observable import Observable
+from sealscope.diagnosis.inference.leak_flow import apparent_conductances
+from sealscope.diagnosis.inference.observable import Observable, step_penalty
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 
@@ -145,7 +145,7 @@ def delay_observables(tests: Sequence[DelayTest], changes: Sequence[DelayChange]
     observables = []
     for channel, test, change, _, onset in tests:
         name = flow if channel == "x" and "x" not in removed else channel
-        advantage = -INFERENCE.delay.penalty(change.value)
+        advantage = -step_penalty(change.value, INFERENCE.delay)
         # two tests: later, or earlier
         observable = Observable.from_test(delay_name(name), DELAYS, test, n_tests=2.0, advantage=advantage)
         observables.append(replace(observable, size=change.value, onset=onset))
@@ -186,15 +186,15 @@ def _size_penalty(
     `flow_scale` convert `size` to the quantity of the prior (`volume_observables`).
     """
     if name == SCALE:
-        return INFERENCE.scale.penalty(size)
+        return step_penalty(size, INFERENCE.scale)
     if name == AIR:
-        return INFERENCE.free_air.penalty(size / volume_ratio, above=True)
+        return step_penalty(size / volume_ratio, INFERENCE.free_air, above=True)
     if name == FLOW_ZERO:
-        return INFERENCE.flow_zero.penalty(size / max(blocks.moving_flow, np.finfo(float).tiny), above=True)
+        return step_penalty(size / max(blocks.moving_flow, np.finfo(float).tiny), INFERENCE.flow_zero, above=True)
     if name == OUTSIDE:
-        return INFERENCE.outside.penalty(size * flow_scale, above=True)
+        return step_penalty(size * flow_scale, INFERENCE.outside, above=True)
     if name.startswith("external leak"):
-        return INFERENCE.outside.penalty(size * flow_scale * blocks.driving_pressure(names, name), above=True)
+        return step_penalty(size * flow_scale * blocks.driving_pressure(names, name), INFERENCE.outside, above=True)
     return 0.0
 
 

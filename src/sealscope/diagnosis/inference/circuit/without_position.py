@@ -45,10 +45,9 @@ from sealscope.diagnosis.inference.equations.balances import (
     locked,
     samples_without_holes,
 )
-from sealscope.diagnosis.inference.equations.signals import Signals
-from sealscope.diagnosis.inference.equations.terms import LEAK, ORIFICE, Equation, Flow
+from sealscope.diagnosis.inference.equations.terms import LEAK, ORIFICE, Equation, Flow, Signals
 from sealscope.diagnosis.inference.machine_states import find_holds
-from sealscope.diagnosis.inference.rows.weak_form import Rows
+from sealscope.diagnosis.inference.rows import Rows
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.motion import estimate_period, fundamental_frequency
 from sealscope.recordings.recording import Array, Recording

@@ -24,8 +24,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.control.drive import Drive
-from sealscope.diagnosis.inference.equations.expressions import increments_of
-from sealscope.diagnosis.inference.equations.signals import MIN_ABSOLUTE_PRESSURE, Signals, interval_means
 from sealscope.diagnosis.inference.equations.terms import (
     BIAS,
     BIAS_TERM,
@@ -37,6 +35,7 @@ from sealscope.diagnosis.inference.equations.terms import (
     LEAKS,
     LINES_TERM,
     LOADED_NULL_FLOW,
+    MIN_ABSOLUTE_PRESSURE,
     MOTIONS,
     MOVING_BIAS,
     NULL_FLOW,
@@ -49,6 +48,7 @@ from sealscope.diagnosis.inference.equations.terms import (
     Coefficient,
     Equation,
     Flow,
+    Signals,
     Term,
     chamber_terms,
     compensated_leak_term,
@@ -58,6 +58,8 @@ from sealscope.diagnosis.inference.equations.terms import (
     external_leak_term,
     fitted_term,
     free_air_term,
+    increments_of,
+    interval_means,
     metering_edge_terms,
     motion_term,
 )

@@ -1,4 +1,4 @@
-"""The terms of a machine's volume balance, computed from recorded channels.
+"""The terms of a machine's volume balance, computed from recorded channels, by expressions where streams need them too.
 
 A balance states where the volume of oil goes that the pump delivers. It is linear in the unknown coefficients of the
 machine. For a pump-controlled cylinder
@@ -7,29 +7,436 @@ machine. For a pump-controlled cylinder
 
 with the pump's displacement D [m^3/rad] and angle theta, the leakage conductance G [m^3/(s Pa)] and a coefficient c_j
 for each term; f_j and g_j are functions of the recorded channels. A term computes its increment f_j dg_j over each
-sampling interval dt, so no signal is differentiated (`weak_form`). With a servo valve, each chamber has a balance. Its
-left side is the volume displaced by the piston, and its terms include the orifice flows of the valve's metering edges.
-G is the same in both chambers.
+sampling interval dt, so no signal is differentiated (`rows`). With a servo valve, each chamber has a balance. Its left
+side is the volume displaced by the piston, and its terms include the orifice flows of the valve's metering edges. G is
+the same in both chambers.
+
+An expression computes the increment of a term, such as ``mean(x) * change(p_A)``; NumPy evaluates it for files
+(`increments_of`), and a kernel for streams is written from it (`build_increments`). Its words are:
+
+- a channel, such as ``p_A``, ``absolute(p_A)``, an absolute pressure, and ``log(...)`` are values at a sample;
+- ``change(v)`` and ``mean(v)``: difference and mean of a value v at the two ends of the interval;
+- ``dt``: the interval [s]; ``rate``: its inverse [Hz]; ``pressure_difference``: mean of p_A - p_B without the sensors'
+  offset; ``out_A``, ``out_B``, ``in_A``, ``in_B``: 1 while the piston moves towards B (out) or A (in) and side A or B
+  carries the load, else 0, and 1/2 if that changes within the interval; ``displacement``: that of the pump [m^3/rad];
+- ``gradient(e)``: change of an increment e from one interval to the next, by a central difference;
+- numbers, and ``+ - * /``.
 
 Source: Merritt, Hydraulic Control Systems, 1967, sections 5.2 and 6.3 (continuity of the chambers, flow of edges).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container
+import ast
+import linecache
+import math
+from collections.abc import Callable, Container, Mapping, Sequence
 from enum import Enum
-from functools import partial
+from functools import cache, cached_property, partial
+from itertools import count
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sealscope.diagnosis.inference.equations.expressions import DIRECTIONS, increments_of
-from sealscope.diagnosis.inference.equations.signals import Signals, interval_means, signed_root
+from sealscope.compiled import kernel
+from sealscope.diagnosis.inference.machine_states import MachineStates, RestLimits, find_states
+from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import Cause
+from sealscope.recordings.channels import CHANNEL_UNITS
 from sealscope.recordings.recording import Array
+from sealscope.units import P_ATM
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
+
+
+#: Minimum absolute pressure in the terms of air [Pa].
+MIN_ABSOLUTE_PRESSURE: float = INFERENCE.pressure.least
+#: Half the time of the central difference for speed and direction [s]: a few encoder counts at slow motion.
+HALF_DIFFERENCE = 0.025
+
+
+class Signals:
+    """Samples (n,) of recorded channels by name, in SI units, and signals derived from them.
+
+    - `rate`: sampling rate [Hz];
+    - `to_absolute`: absolute minus gauge pressure [Pa] by channel, by default atmospheric pressure;
+    - `offset`: sensor offset [Pa] that is subtracted from p_A - p_B;
+    - `rest_limits`: speeds below which the machine rests, None to find no rests.
+    """
+
+    def __init__(
+        self,
+        channels: Mapping[str, Array],
+        rate: float,
+        to_absolute: Mapping[str, float] | None = None,
+        offset: float = 0.0,
+        rest_limits: RestLimits | None = None,
+    ) -> None:
+        self._channels, self.rate, self._to_absolute, self._offset = channels, rate, to_absolute or {}, offset
+        self._rest_limits = rest_limits
+        self._states: MachineStates | None = None
+        self._steps, self._means = dict[str, Array](), dict[str, Array]()
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._channels
+
+    def __getitem__(self, name: str) -> Array:
+        return self._channels[name]
+
+    def step(self, name: str) -> Array:
+        """Return the differences (n - 1,) of neighbouring samples of a channel, which are kept."""
+        if name not in self._steps:
+            values = self._channels[name]
+            self._steps[name] = values[1:] - values[:-1]
+        return self._steps[name]
+
+    def mean(self, name: str) -> Array:
+        """Return the means (n - 1,) of neighbouring samples of a channel, which are kept."""
+        if name not in self._means:
+            self._means[name] = interval_means(self._channels[name])
+        return self._means[name]
+
+    @property
+    def dt(self) -> float:
+        """Sampling interval [s]."""
+        return 1.0 / self.rate
+
+    @property
+    def time_step(self) -> Array:
+        """Sampling interval dt [s], repeated for each interval, shape (n - 1,)."""
+        return np.full(len(next(iter(self._channels.values()))) - 1, self.dt)
+
+    @cached_property
+    def pressure_difference(self) -> Array:
+        """p_A - p_B [Pa] in the middle of each sampling interval, without the sensor offset, shape (n - 1,)."""
+        return self.compute_pressure_difference()
+
+    def compute_pressure_difference(self) -> Array:
+        """Compute `pressure_difference` anew, which the caller may change; it is not kept."""
+        difference = self._difference("p_A", "p_B")
+        difference -= self._offset
+        return difference
+
+    @property
+    def pressure_root(self) -> Array:
+        """sign(dp) sqrt(abs(dp)) [Pa^0.5] of the pressure difference dp = p_A - p_B, shape (n - 1,)."""
+        return signed_root(self.pressure_difference)
+
+    @cached_property
+    def port_difference(self) -> Array:
+        """p_1 - p_2 [Pa] of the two ports of pump or valve, in the middle of each sampling interval, shape (n - 1,)."""
+        return self._difference("p_1", "p_2")
+
+    def _difference(self, name: str, other: str) -> Array:
+        """Compute the difference (n - 1,) of the means of two channels, neither of which is kept."""
+        difference = interval_means(self._channels[name])
+        difference -= interval_means(self._channels[other])
+        return difference
+
+    @cached_property
+    def absolute_pressure(self) -> Mapping[str, Array]:
+        """Absolute pressure [Pa] at each sample, at least `MIN_ABSOLUTE_PRESSURE`, by the names "p_A" and "p_B"."""
+        return {
+            name: np.maximum(self._channels[name] + self._to_absolute.get(name, P_ATM), MIN_ABSOLUTE_PRESSURE)
+            for name in ("p_A", "p_B")
+        }
+
+    @cached_property
+    def speed(self) -> Array:
+        """Speed of the piston [m/s] at each sample, by a central difference of x; x stays constant beyond the ends."""
+        half_width = max(1, round(HALF_DIFFERENCE * self.rate))  # [samples]
+        return central_difference(self._channels["x"], half_width) * (0.5 * self.rate / half_width)
+
+    @cached_property
+    def carried_by_A(self) -> Array:
+        """1 for each sample (n,) in which side A carries the load, i.e. p_A - p_B exceeds the sensor offset, else 0.
+
+        It is 0 also where a pressure is missing.
+        """
+        return (self._channels["p_A"] > self._channels["p_B"] + self._offset).astype(float)
+
+    @cached_property
+    def unknown_motion(self) -> NDArray[np.intp]:
+        """Indices of the intervals at either end of which the speed is missing."""
+        return np.flatnonzero(np.isnan(interval_means(self.speed)))
+
+    def direction_weights(self, outward: bool, by_A: bool) -> Array:
+        """Return 1 for each interval (n - 1,) of motion in a given direction while a given side carries the load.
+
+        `outward`: motion towards B, or standstill, as opposed to motion towards A; `by_A`: side A, as opposed to B, has
+        the load (`carried_by_A`). Other intervals have the weight 0, and 1/2 if direction or side change within. A
+        missing speed counts as towards A.
+        """
+        is_counted = ((self.speed >= 0.0) == outward) & (self.carried_by_A == by_A)
+        return interval_means(is_counted.astype(float))
+
+    def moving(self, pump_volume: Callable[[Signals], Array]) -> Array:
+        """Return 1 for each sampling interval (n - 1,) in which pump and piston move, else 0.
+
+        `pump_volume` computes the left side of the volume balance [m^3] in each interval; later calls use that of the
+        first one. Without `rest_limits` all intervals count as motion.
+        """
+        states = self._find_states(pump_volume)
+        return np.ones_like(self.time_step) if states is None else states.moving.astype(float)
+
+    def holding(self, pump_volume: Callable[[Signals], Array]) -> Array:
+        """Return 1 for each sampling interval (n - 1,) in which the pump turns and the piston rests, else 0.
+
+        `pump_volume`: as in `moving`. Without `rest_limits` the piston never rests.
+        """
+        states = self._find_states(pump_volume)
+        return np.zeros_like(self.time_step) if states is None else states.holding.astype(float)
+
+    def _find_states(self, pump_volume: Callable[[Signals], Array]) -> MachineStates | None:
+        """Find the states of the machine once, for later calls, too; None without `rest_limits`."""
+        if self._states is None and self._rest_limits is not None:
+            self._states = find_states(pump_volume(self), self.step("x"), self.rate, self._rest_limits)
+        return self._states
+
+
+def central_difference(values: Array, half_width: int) -> Array:
+    """Compute the difference (n,) of the values `half_width` samples after and before each of n samples.
+
+    It is not divided by the time. Beyond the ends the first and last values are repeated.
+    """
+    padded = np.empty(len(values) + 2 * half_width)
+    padded[:half_width], padded[half_width:-half_width], padded[-half_width:] = values[:1], values, values[-1:]
+    return np.asarray(padded[2 * half_width :] - padded[: -2 * half_width])
+
+
+def interval_means(values: Array) -> Array:
+    """Compute the means of neighbouring samples (n,), shape (n - 1,)."""
+    means = values[1:] + values[:-1]
+    means *= 0.5
+    return means
+
+
+def signed_root(values: Array) -> Array:
+    """Compute sign(v) sqrt(abs(v)) of each value v."""
+    return np.asarray(np.sign(values) * np.sqrt(np.abs(values)))
+
+
+#: Directions of motion with the side that carries the load: (towards B, side A) by the word of an expression.
+DIRECTIONS = {"out_A": (True, True), "out_B": (True, False), "in_A": (False, True), "in_B": (False, False)}
+_FUNCTIONS = ("change", "mean", "absolute", "log", "gradient")
+_WORDS = (*DIRECTIONS, "dt", "rate", "pressure_difference", "displacement")
+_OPERATORS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
+_numbers = count(1)
+
+
+@cache
+def parse_expression(text: str) -> ast.expr:
+    """Parse an expression; raise ValueError with the word that it must not have."""
+    tree = ast.parse(text, mode="eval").body
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Name):
+            known = node.id in CHANNEL_UNITS or node.id in _WORDS or node.id in _FUNCTIONS
+        elif isinstance(node, ast.Constant):
+            known = isinstance(node.value, (int, float))
+        else:
+            known = isinstance(node, (ast.Call, ast.BinOp, ast.expr_context, *_OPERATORS))
+        if not known:
+            raise ValueError(f"an expression of a term must be of its words, got {ast.unparse(node)!r} in {text!r}")
+    return tree
+
+
+@cache
+def channels_of(text: str) -> frozenset[str]:
+    """Return the channels that an expression reads."""
+    names = {node.id for node in ast.walk(parse_expression(text)) if isinstance(node, ast.Name)}
+    needed = names & set(CHANNEL_UNITS)
+    needed |= {"p_A", "p_B"} if "pressure_difference" in names else set()
+    return frozenset(needed | ({"p_A", "p_B", "x"} if names & set(DIRECTIONS) else set()))
+
+
+@cache
+def increments_of(text: str, displacement: float = 1.0) -> Callable[[Signals], Array]:
+    """Return a function that evaluates an expression over all sampling intervals of `Signals`, shape (n - 1,)."""
+    evaluate = _over_intervals(parse_expression(text), displacement)
+
+    def increments(signals: Signals) -> Array:
+        """Evaluate the expression."""
+        values = evaluate(signals)
+        return np.asarray(values) if np.ndim(values) else np.full(len(signals.time_step), values)
+
+    return increments
+
+
+#: Evaluates a part of an expression, over the sampling intervals (n - 1,) or at the samples (n,) of `Signals`.
+_Evaluate = Callable[[Signals], Any]
+
+
+def _over_intervals(node: ast.expr, displacement: float) -> _Evaluate:
+    """Build the function that evaluates an expression over the sampling intervals (n - 1,)."""
+    if isinstance(node, ast.Constant):
+        return _constant(node)
+    if isinstance(node, ast.BinOp):
+        return _binary(node, *(_over_intervals(side, displacement) for side in (node.left, node.right)))
+    if isinstance(node, ast.Name):
+        if node.id in DIRECTIONS:
+            return partial(_direction, *DIRECTIONS[node.id])
+        words: dict[str, _Evaluate] = {
+            "pressure_difference": lambda s: s.pressure_difference,
+            "dt": lambda s: s.dt,
+            "rate": lambda s: s.rate,
+            "displacement": lambda _: displacement,
+        }
+        return words[node.id]
+    name, value = _call(node)
+    if name == "gradient":
+        rates = _over_intervals(value, displacement)
+        return lambda s: np.gradient(rates(s))
+    if isinstance(value, ast.Name):
+        channel = value.id
+        return (lambda s: s.step(channel)) if name == "change" else (lambda s: s.mean(channel))
+    points, combine = _at_samples(value), np.diff if name == "change" else interval_means
+    return lambda s: combine(points(s))
+
+
+def _at_samples(node: ast.expr) -> _Evaluate:
+    """Build the function that evaluates an expression at the samples (n,)."""
+    if isinstance(node, ast.Constant):
+        return _constant(node)
+    if isinstance(node, ast.Name):
+        channel = node.id
+        return lambda s: s[channel]
+    if isinstance(node, ast.BinOp):
+        return _binary(node, _at_samples(node.left), _at_samples(node.right))
+    name, value = _call(node)
+    if name == "absolute":
+        assert isinstance(value, ast.Name)
+        pressure = value.id
+        return lambda s: s.absolute_pressure[pressure]
+    points = _at_samples(value)
+
+    def logarithm(s: Signals) -> Array:
+        """Compute the logarithm at each sample."""
+        values = np.asarray(points(s))
+        logarithms = np.empty(values.shape)
+        _take_logarithms(values, logarithms)
+        return logarithms
+
+    return logarithm
+
+
+def _constant(node: ast.Constant) -> _Evaluate:
+    """Build the function that returns a number."""
+    number = float(node.value)  # type: ignore[arg-type]
+    return lambda _: number
+
+
+def _binary(node: ast.BinOp, left: _Evaluate, right: _Evaluate) -> _Evaluate:
+    """Build the function that applies an operator to the values of both sides."""
+    operator = {"+": np.add, "-": np.subtract, "*": np.multiply, "/": np.divide}[_OPERATORS[type(node.op)]]  # type: ignore[index]
+    return lambda s: operator(left(s), right(s))
+
+
+def _direction(outward: bool, by_A: bool, s: Signals) -> Array:
+    """Return the weights of a direction of motion with the side that carries the load, NaN without a known speed."""
+    weights = s.direction_weights(outward, by_A)
+    weights[s.unknown_motion] = np.nan
+    return weights
+
+
+@kernel
+def _take_logarithms(values: Any, logarithms: Any) -> None:
+    """Compute logarithms by the function that streams call: NumPy's may differ in the last bit."""
+    for i in range(len(values)):
+        logarithms[i] = math.log(values[i])
+
+
+def _call(node: ast.expr) -> tuple[str, ast.expr]:
+    """Return name and argument of a function in an expression."""
+    if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and len(node.args) == 1):
+        raise ValueError(f"a function of an expression must have one argument, got {ast.unparse(node)!r}")
+    return node.func.id, node.args[0]
+
+
+def build_increments(
+    expressions: Sequence[str],
+    channels: Mapping[str, int],
+    limits: Mapping[str, float],
+    to_absolute: Mapping[str, float],
+) -> Callable[..., None]:
+    """Write a function that evaluates expressions over one interval of the last samples, for `compiled.large_law`.
+
+    The function's arguments are `ring` (channels, width), in whose columns sample k stands at k modulo the width; the
+    interval k, from sample k to k + 1; `half`, the samples on either side of the central difference that shows the
+    direction of motion; `rate` [Hz]; `displacement` [m^3/rad]; and `out`, which receives the increments. `channels`:
+    rows of `ring` by name; `limits`: `MAX_READING`, beyond which a reading is missing, and `BEYOND`, a missing one;
+    `to_absolute`: absolute minus gauge pressure [Pa] by channel, by default atmospheric pressure.
+    """
+    lines = [
+        "def compute_increments(ring: Any, k: int, half: int, rate: float, displacement: float, out: Any) -> None:",
+        '    """Compute the increments of all terms of the volume balance over the interval from sample k to k + 1."""',
+        "    width = ring.shape[1]",
+        "    earlier, later = max(k - 1, 0), k + 1",
+    ]
+    words = {node.id for text in expressions for node in ast.walk(parse_expression(text)) if isinstance(node, ast.Name)}
+    if words & set(DIRECTIONS):
+        x, p_A, p_B = (channels[name] for name in ("x", "p_A", "p_B"))
+        lines += [f"    {word} = 0.0" for word in DIRECTIONS] + ["    is_known = True"]
+        lines += [
+            "    for i in range(k, k + 2):  # either end of the interval counts half",
+            f"        x_before, x_after = ring[{x}, max(i - half, 0) % width], ring[{x}, (i + half) % width]",
+            "        is_known = is_known and max(abs(x_before), abs(x_after)) < MAX_READING",
+            "        is_outward = x_after >= x_before",
+            f"        A_carries = ring[{p_A}, i % width] > ring[{p_B}, i % width]",
+        ]
+        for word, (outward, by_A) in DIRECTIONS.items():
+            conditions = f"is_outward == {outward} and A_carries == {by_A}"
+            lines += [f"        if {conditions}:", f"            {word} += 0.5"]
+    for column, text in enumerate(expressions):
+        lines.append(f"    out[{column}] = {_interval_text(parse_expression(text), 'k', channels, to_absolute)}")
+    if words & set(DIRECTIONS):  # without a direction the interval counts as one with a missing reading
+        lines += ["    if not is_known:", "        out[0] = BEYOND"]
+    source = "\n".join([*lines, ""])
+    file = f"<terms {next(_numbers)}>"
+    linecache.cache[file] = (len(source), None, source.splitlines(keepends=True), file)
+    namespace: dict[str, Any] = {"Any": Any, "math": math, **limits}
+    exec(compile(source, file, "exec"), namespace)
+    return namespace["compute_increments"]  # type: ignore[no-any-return]
+
+
+def _interval_text(node: ast.expr, interval: str, channels: Mapping[str, int], to_absolute: Mapping[str, float]) -> str:
+    """Write an expression over an interval, from the sample of this name to the next."""
+    if isinstance(node, ast.Constant):
+        return repr(float(node.value))  # type: ignore[arg-type]
+    if isinstance(node, ast.BinOp):
+        sides = (_interval_text(side, interval, channels, to_absolute) for side in (node.left, node.right))
+        return f"({next(sides)} {_OPERATORS[type(node.op)]} {next(sides)})"  # type: ignore[index]
+    if isinstance(node, ast.Name):
+        if node.id == "pressure_difference":
+            difference = ast.parse("mean(p_A) - mean(p_B)", mode="eval").body
+            return _interval_text(difference, interval, channels, to_absolute)
+        return "(1.0 / rate)" if node.id == "dt" else node.id
+    name, value = _call(node)
+    if name == "gradient":
+        after, before = (_interval_text(value, k, channels, to_absolute) for k in ("later", "earlier"))
+        return f"(({after} - {before}) / (later - earlier))"
+    points = (_point_text(value, sample, channels, to_absolute) for sample in (interval, f"({interval} + 1)"))
+    first, second = points
+    return f"({second} - {first})" if name == "change" else f"(0.5 * ({second} + {first}))"
+
+
+def _point_text(node: ast.expr, sample: str, channels: Mapping[str, int], to_absolute: Mapping[str, float]) -> str:
+    """Write an expression at the sample of this name."""
+    if isinstance(node, ast.Constant):
+        return repr(float(node.value))  # type: ignore[arg-type]
+    if isinstance(node, ast.Name):
+        return f"ring[{channels[node.id]}, {sample} % width]"
+    if isinstance(node, ast.BinOp):
+        sides = (_point_text(side, sample, channels, to_absolute) for side in (node.left, node.right))
+        return f"({next(sides)} {_OPERATORS[type(node.op)]} {next(sides)})"  # type: ignore[index]
+    name, value = _call(node)
+    inner = _point_text(value, sample, channels, to_absolute)
+    if name != "absolute":
+        return f"math.log({inner})"
+    assert isinstance(value, ast.Name)
+    return f"max({inner} + {to_absolute.get(value.id, P_ATM)!r}, {MIN_ABSOLUTE_PRESSURE!r})"
+
 
 #: Kinds of coefficients: each has a prior on its differences between recordings and, but for "speed", on its drift.
 Coefficient = Literal["motion", "speed", "compliance", "air", "bias", "piston", "pump", "outside", "edge"]
@@ -56,7 +463,7 @@ class Term(NamedTuple):
         Pressure or square root of a pressure that drives the flow, so that an offset of a pressure sensor changes the
         increments; "" if such an offset is neglected.
     expression : str
-        The increments as an expression (`expressions`), which streams compute, too; "" if only files compute them.
+        The increments as an expression, which streams compute, too; "" if only files compute them.
     """
 
     name: str

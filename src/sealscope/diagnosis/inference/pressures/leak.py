@@ -12,7 +12,7 @@ import numpy as np
 
 from sealscope.diagnosis.estimate.change import Information, StepTest, fit_history, step_test
 from sealscope.diagnosis.estimate.interval import WITHIN_95, Estimate
-from sealscope.diagnosis.inference.comparison.levels import Rise, rise
+from sealscope.diagnosis.inference.comparison import Rise, rise
 from sealscope.diagnosis.inference.equations.terms import LEAK
 from sealscope.diagnosis.inference.observable import UNKNOWN_FLOW, LeakMeasure, LeakRise
 from sealscope.diagnosis.inference.pressures.fit import Priors

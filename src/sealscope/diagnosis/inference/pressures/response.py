@@ -65,8 +65,7 @@ from sealscope.diagnosis.inference.pressures.samples import (
 )
 from sealscope.diagnosis.priors.pressures import PRESSURE
 from sealscope.physics.lanes import WIDTH
-from sealscope.recordings.joining import start_seconds
-from sealscope.recordings.oil import oil_temperature
+from sealscope.recordings.header import oil_temperature, start_seconds
 from sealscope.recordings.recording import Array, Recording, compute_once
 from sealscope.signals.recursion import filter_recursively
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from sealscope.diagnosis.estimate.change import MIN_BLOCKS
 from sealscope.diagnosis.healthy import Summary
-from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
-from sealscope.diagnosis.inference.rows.weak_form import MAX_READING
+from sealscope.diagnosis.inference.comparison import RecordingSums
+from sealscope.diagnosis.inference.rows import MAX_READING
 from sealscope.diagnosis.priors.pressures import PRESSURE
 from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE
 from sealscope.recordings.quality import is_mostly_clipped

@@ -13,13 +13,18 @@ from sealscope.diagnosis.estimate.interval import UPPER_95, WITHIN_95, Estimate,
 from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY, Mixture, weigh_alternatives
 from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
 from sealscope.diagnosis.inference.circuit.holds.leaks import growth_factor
-from sealscope.diagnosis.inference.comparison.levels import Rise, compare_laws, held_rise, rise
-from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums, find_unusual_conditions
+from sealscope.diagnosis.inference.comparison import (
+    RecordingSums,
+    Rise,
+    compare_laws,
+    find_unusual_conditions,
+    held_rise,
+    rise,
+)
 from sealscope.diagnosis.inference.equations.terms import Flow
 from sealscope.diagnosis.inference.hypotheses import LAWS
-from sealscope.diagnosis.inference.leak_law import mixture_flow
+from sealscope.diagnosis.inference.leak_flow import RiseFits, estimate_step_flow, fit_rise, mixture_flow
 from sealscope.diagnosis.inference.observable import UNKNOWN_FLOW, LeakMeasure, LeakRise, Remark
-from sealscope.diagnosis.inference.volumes.leak_flow import RiseFits, estimate_step_flow, fit_rise
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import VOLUME_BALANCE, Cause, LeakCourse, RelativeLeak, TotalLeakage

@@ -34,13 +34,14 @@ from sealscope.diagnosis.inference.changes.motion_fit import fit_difference
 from sealscope.diagnosis.inference.changes.volumes import delay_observables, volume_observables
 from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
 from sealscope.diagnosis.inference.circuit.holds.hold_oil import CylinderSides
+from sealscope.diagnosis.inference.circuit.holds.leaks import estimate_pump_leakage
 from sealscope.diagnosis.inference.circuit.holds.recorded_hold import (
     LockedHold,
     find_charge_pressure,
     find_locked_holds,
 )
 from sealscope.diagnosis.inference.circuit.without_position import recorded_oil_loss_tests
-from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums, block_weights
+from sealscope.diagnosis.inference.comparison import RecordingSums, block_weights
 from sealscope.diagnosis.inference.delays import DelayChange, DelayTest
 from sealscope.diagnosis.inference.equations.balances import (
     READ,
@@ -48,22 +49,35 @@ from sealscope.diagnosis.inference.equations.balances import (
     find_rest_limits,
     motions_of_side,
 )
-from sealscope.diagnosis.inference.equations.signals import MIN_ABSOLUTE_PRESSURE, Signals, interval_means
-from sealscope.diagnosis.inference.equations.terms import CYLINDER, LAG, LINES, TURNING, Equation, Flow
+from sealscope.diagnosis.inference.equations.terms import (
+    CYLINDER,
+    LAG,
+    LINES,
+    MIN_ABSOLUTE_PRESSURE,
+    TURNING,
+    Equation,
+    Flow,
+    Signals,
+    interval_means,
+)
 from sealscope.diagnosis.inference.hypotheses import Valves
-from sealscope.diagnosis.inference.leak_law import find_leak_step, with_turbulence
+from sealscope.diagnosis.inference.leak_flow import (
+    StateLoad,
+    StateLoads,
+    TotalFlow,
+    estimate_total_flow,
+    find_leak_step,
+    with_turbulence,
+)
 from sealscope.diagnosis.inference.machine_states import extend_rests, find_rests, flag_lowering
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.regimes import RegimeBlocks, fit_with_robust_covariance, rest_log_odds
-from sealscope.diagnosis.inference.rows.weak_form import half_width
-from sealscope.diagnosis.inference.volumes.held_pump import estimate_pump_leakage
-from sealscope.diagnosis.inference.volumes.total import StateLoad, StateLoads, TotalFlow, estimate_total_flow
+from sealscope.diagnosis.inference.rows import half_width
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import RAREST
 from sealscope.diagnosis.verdict.machine_sizes import measures_flow
 from sealscope.recordings.channels import COUNTS, METERS, flow_source
-from sealscope.recordings.joining import start_seconds
-from sealscope.recordings.oil import oil_temperature
+from sealscope.recordings.header import oil_temperature, start_seconds
 from sealscope.recordings.recording import Array, Recording, compute_once
 from sealscope.signals.smoothing import average_over
 from sealscope.units import P_ATM
@@ -189,7 +203,7 @@ class RecordedBalance:
     def block_weights(self, healthy: Sequence[RecordingSums]) -> Array:
         """Compute the weights (K,) of `running_blocks` in the rise of the leakage over `healthy` recordings.
 
-        A leak with the coefficient g_k in block k causes the rise sum_k w_k g_k (`recording_sums.block_weights`). The
+        A leak with the coefficient g_k in block k causes the rise sum_k w_k g_k (`comparison.block_weights`). The
         weights of all blocks have the sum 1.
         """
         grams = scale_grams(self.blocks, self.columns)
@@ -605,7 +619,7 @@ class RecordedBalance:
 
     @cached_property
     def total_flow(self) -> TotalFlow | None:
-        """Mean leakage of pump and piston together over the recording [m^3/s] (`total`), None if not identified.
+        """Mean leakage of pump and piston over the recording [m^3/s] (`estimate_total_flow`), None if not identified.
 
         It needs the pump's angle or speed: a flow meter does not see the leakage inside the pump, a command not the
         drive that slows down under load, and behind a servo valve the edges leak as well. The 95 % interval must

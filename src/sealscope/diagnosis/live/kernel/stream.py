@@ -2,7 +2,7 @@
 
 The equations are those of the live volume balance (`diagnosis.live`, `diagnosis.inference`); its terms are the
 expressions of `equations.terms`. A row is this balance, integrated with a test function over `SPAN` strides
-(`rows.weak_form`); a row begins every stride of about 0.125 s. `add_sample` adds the increments of the balance's terms
+(`rows`); a row begins every stride of about 0.125 s. `add_sample` adds the increments of the balance's terms
 to the unfinished rows. At the end of a block of 3 s, its rows are weighted and summed to a Gram matrix, the products of
 all terms, from which the block's leakage conductance is estimated and tested for a step. This work is divided into
 parts of similar length: each call of `advance` does one, so that a controller spreads the end of a block over its
@@ -36,34 +36,38 @@ from sealscope.diagnosis.estimate.interval import WITHIN_95
 from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.equations.balances import PUMP_VOLUMES
-from sealscope.diagnosis.inference.equations.expressions import build_increments, channels_of
-from sealscope.diagnosis.inference.equations.signals import HALF_DIFFERENCE
-from sealscope.diagnosis.inference.rows import flow_sign
-from sealscope.diagnosis.inference.rows.row_weights import (
+from sealscope.diagnosis.inference.equations.terms import HALF_DIFFERENCE, build_increments, channels_of
+from sealscope.diagnosis.inference.rows import (
+    BEYOND,
     MAX_ITERATIONS,
+    MAX_READING,
+    MIN_STRIDE,
+    MOTION_SCORE,
+    N_LOAD_SUMS,
+    N_MOTION_SUMS,
+    SPAN,
+    STRIDE,
     SUPPORT,
     Workspace,
+    add_load,
+    add_motion,
     add_reduced,
+    add_to_rows,
     eliminate,
     eliminate_fast,
     fit_blocks,
+    leak_score,
     median,
     move_sums,
+    peak_weight,
     reweigh,
     start_normal,
-    sum_products,
-    workspace_shapes,
-)
-from sealscope.diagnosis.inference.rows.weak_form import (
-    BEYOND,
-    MAX_READING,
-    MIN_STRIDE,
-    SPAN,
-    STRIDE,
-    add_to_rows,
-    peak_weight,
     stride_samples,
     strides_in,
+    sum_log_odds,
+    sum_products,
+    workspace_shapes,
+    z_score,
 )
 from sealscope.diagnosis.live.coefficients import (
     MISFIT,
@@ -331,9 +335,9 @@ def stream_layout(settings: StreamSettings) -> np.dtype[Any]:
         ring=(len(settings.channels), 2 * half + 2),  # last samples, those that the increments need
         increments=(n_increments,),  # of each term of the balance over the last sampling interval
         unfinished=(SPAN, n_increments),  # the rows to which the present sample adds
-        # sums over rows, until the flow's sign is known (`flow_sign`); loads: p_A - p_B and, if it differs, the force
-        sign_motion=(flow_sign.N_MOTION_SUMS,),
-        sign_loads=(n_increments - n_columns + 1, flow_sign.N_LOAD_SUMS),
+        # sums over rows, until the sign is known (`sum_log_odds`); loads: p_A - p_B and, if it differs, the force
+        sign_motion=(N_MOTION_SUMS,),
+        sign_loads=(n_increments - n_columns + 1, N_LOAD_SUMS),
         ends=(SUPPORT,),  # index past the last row of each open block
         closed_ends=(SUPPORT,),  # the same of the blocks that are worked on
         # sum of abs(p_A - p_B), and number of samples; + 1: the last rows of a block end when the next has begun
@@ -487,10 +491,10 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
         motion, flow = 0.0, m.unfinished[slot, response]
         for j in piston:
             motion += m.unfinished[slot, j]
-        flow_sign.add_motion(m.sign_motion, motion, flow)
-        flow_sign.add_load(m.sign_loads[0], m.unfinished[slot, leak], flow)
+        add_motion(m.sign_motion, motion, flow)
+        add_load(m.sign_loads[0], m.unfinished[slot, leak], flow)
         for j in range(n_columns, n_increments):
-            flow_sign.add_load(m.sign_loads[1], m.unfinished[slot, j], flow)
+            add_load(m.sign_loads[1], m.unfinished[slot, j], flow)
 
     @law
     def add_sample(m: Any, p_A: float, p_B: float, flow: float, x: float) -> None:
@@ -557,7 +561,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
 
     @large_law
     def weigh_part(m: Any) -> None:
-        """Do a part of the weighting of rows: see `row_weights.weigh_rows`.
+        """Do a part of the weighting of rows: see `rows.weigh_rows`.
 
         In the last pass, with the final weights, each block is used as soon as its Gram matrix is computed.
         """
@@ -602,7 +606,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
 
     @large_law
     def find_flow_sign(m: Any) -> None:
-        """Find the sign of the pump's recorded flow, `m.angle_sign`, 1 or -1, by the symptoms of `flow_sign`.
+        """Find the sign of the pump's recorded flow, `m.angle_sign`, 1 or -1, by `sum_log_odds`.
 
         The leak is that of the blocks that wait for the first fit. The sign is final once the piston has surely moved.
         """
@@ -618,11 +622,11 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
         whole_energy = block[leak, leak]
         eliminate(block, n_nuisances)
         energy, moment, square = block[leak, leak], block[leak, response], block[response, response]
-        leak_z = flow_sign.leak_score(energy, moment, square, whole_energy, n_rows - n_nuisances - 1.0)
-        motion_z = flow_sign.z_score(m.sign_motion[0], m.sign_motion[1])
-        log_odds = flow_sign.sum_log_odds(leak_z, m.sign_loads[0], m.sign_loads[n_increments - n_columns], motion_z)
+        leak_z = leak_score(energy, moment, square, whole_energy, n_rows - n_nuisances - 1.0)
+        motion_z = z_score(m.sign_motion[0], m.sign_motion[1])
+        log_odds = sum_log_odds(leak_z, m.sign_loads[0], m.sign_loads[n_increments - n_columns], motion_z)
         m.angle_sign = -1.0 if log_odds < 0.0 else 1.0
-        m.has_sign = 1 if abs(motion_z) > flow_sign.MOTION_SCORE else 0
+        m.has_sign = 1 if abs(motion_z) > MOTION_SCORE else 0
 
     @law
     def correct_sign(m: Any) -> None:
