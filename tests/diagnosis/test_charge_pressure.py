@@ -140,7 +140,7 @@ def test_only_external_leaks_make_the_charge_pressure_fall() -> None:
     change = next(
         change for change in compare_low_drifts(estimate_low_drifts(record(fall=300.0)), HEALTHY) if change.name == FALL
     )
-    assert {event.cause for event in load_events() if event.affects(change)} == {"external leak"}
+    assert {event.cause for event in load_events() if event.changes(change, "moves")} == {"external leak"}
 
 
 def lose_oil(flow: float, onset: float, volume: float = 2e-3) -> ChargeTrend:

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.decision.case import HealthyNull, null_key
+from sealscope.diagnosis.decision.case import HealthyNull
 from sealscope.diagnosis.inference.observable import Observable
 
 from .cases import observable
 
 CHANGE = observable("volumes: leak", 1e-6)
-KEY = null_key(CHANGE)
+KEY = CHANGE.key
 
 
 def chance(*surprisals: float, of: Observable = CHANGE) -> float:

@@ -54,7 +54,7 @@ NODES = 64
 class HealthyNull:
     """Distribution of p-values in healthy recordings of a machine, by which the p-values of detectors are calibrated.
 
-    `surprisals`: -log(chance) of each test in each healthy recording, by the test's key (`null_key`, `case.step_key`).
+    `surprisals`: -log(chance) of each test in each healthy recording, by the test's key (`Observable.key`, `STEP_KEY`).
     """
 
     surprisals: Mapping[str, Sequence[float]] = field(default_factory=dict)
@@ -62,7 +62,7 @@ class HealthyNull:
 
     def chance(self, observable: Observable) -> float:
         """Compute the p-value of an observable, corrected by those of healthy recordings as in `calibrate`."""
-        return self.calibrate(null_key(observable), observable.chance)
+        return self.calibrate(observable.key, observable.chance)
 
     def calibrate(self, key: str, chance: float) -> float:
         """Correct a detector's p-value `chance` by the p-values that it stated for healthy recordings (`key`).
@@ -101,17 +101,8 @@ def _inflation_posterior(surprisals: Sequence[float]) -> tuple[Array, Array]:
     return weigh_alternatives(log_posterior), inflation
 
 
-def null_key(observable: Observable) -> str:
-    """Return the key of an observable in `HealthyNull.surprisals`, such as "noise: noise of the pressures".
-
-    Observables without an onset are comparisons with healthy recordings, and share one key for their kind of data.
-    """
-    return comparison_key(observable.data) if observable.onset is None else f"{observable.data}: {observable.name}"
-
-
-def comparison_key(data: str) -> str:
-    """Return the key of comparisons of a kind of data in `HealthyNull.surprisals`, such as "details: against"."""
-    return f"{data}: against"
+#: Key in `HealthyNull.surprisals` of a detector's test for a step of the leakage, by the detector's name.
+STEP_KEY = "{}: step"
 
 
 #: Name of the third test, besides WITHIN and AGAINST: for leakage above the limit in the rig's file.
@@ -161,30 +152,24 @@ class Case:
         """
         # the other leak event, "pump leak", affects the volume balance alone, which measures leakage
         leak = next(event for event in load_events() if event.name == LEAK_EVENTS[0])
-        affected = [observable for observable in self.judge.observables if leak.affects(observable)]
+        affected = [observable for observable in self.judge.observables if leak.changes(observable, "moves")]
         return min(affected, key=lambda observable: observable.chance, default=None)
 
-    @property
-    def rarest_chance(self) -> float:
-        """Smallest calibrated p-value of the observables, times the number of tests (Bonferroni correction).
+    def find_rarest(self) -> tuple[float, str]:
+        """Find the smallest calibrated p-value of the observables, times the number of tests, and words for its change.
 
-        Observables with the same distribution in healthy recordings (`null_key`) count as one test.
-        """
-        n_tests = len({null_key(observable) for observable in self.observables})
-        return min(1.0, n_tests * min(map(self.null.chance, self.observables), default=1.0))
-
-    @property
-    def rarest_change(self) -> str:
-        """Words for what the observable with the smallest calibrated p-value shows; "" without observables.
-
-        They are those of the event with the largest prior probability that changes it, or else its name.
+        Observables with the same distribution in healthy recordings (`Observable.key`) count as one test (Bonferroni
+        correction). The words are those of the event with the largest prior probability that changes the observable,
+        or else its name; 1 and "" without observables.
         """
         rarest = min(self.observables, key=self.null.chance, default=None)
         if rarest is None:
-            return ""
+            return 1.0, ""
         events = [event for event in load_events() if event.cause and event.changes(rarest)]
         likeliest = max(events, key=lambda event: event.probability, default=None)
-        return rarest.name if likeliest is None else likeliest.description
+        n_tests = len({observable.key for observable in self.observables})
+        chance = min(1.0, n_tests * self.null.chance(rarest))
+        return chance, rarest.name if likeliest is None else likeliest.description
 
     @cached_property
     def explanations(self) -> tuple[Explanation, ...]:
@@ -250,8 +235,23 @@ class Case:
 
     @cached_property
     def tests(self) -> tuple[LeakTest, ...]:
-        """The tests that the report allows; their false-alarm probabilities add up to `false_alarm_probability`."""
-        return _leak_tests(self, self.leak) if self.leak is not None else _change_tests(self)
+        """The tests that the report allows; their false-alarm probabilities add up to `false_alarm_probability`.
+
+        A detector that does not measure leakage has one, by `tested_observable`, and states no threshold. It is
+        computed as the score with a calibrated p-value equal to the allowed false-alarm probability, assuming that
+        scores are proportional to the logarithm of the detector's p-value.
+        """
+        if self.leak is not None:
+            return _leak_tests(self, self.leak)
+        rarest = self.tested_observable
+        if rarest is None:
+            return ()
+        allowed = self.false_alarm_probability
+        allowed_chance = self.null.uncalibrated_chance(rarest.key, allowed)  # p-value that the detector would state
+        rarest_chance = min(max(rarest.chance, 1e-300), 1.0 - 1e-9)  # the logarithm is finite and not 0
+        threshold = max(float(rarest.score * np.log(allowed_chance) / np.log(rarest_chance)), 0.0)
+        name = WITHIN if rarest.onset is not None else AGAINST  # only a change within a recording has an onset
+        return (LeakTest(name, rarest.score, threshold, chance=self.null.chance(rarest), probability=allowed),)
 
     @property
     def alarms(self) -> tuple[LeakTest, ...]:
@@ -303,8 +303,8 @@ class Case:
             observable: [event for event in named_events if event.changes(observable)]
             for observable in self.observables
         }
-        # observables with the same distribution in healthy recordings (`null_key`) count as one test
-        n_tests = len({null_key(observable) for observable, candidates in candidates_of.items() if candidates})
+        # observables with the same distribution in healthy recordings (`Observable.key`) count as one test
+        n_tests = len({observable.key for observable, candidates in candidates_of.items() if candidates})
         # `heading`: probability of naming an event by mistake, over that of a false alarm
         allowed = DECISION.explanation.heading * self.false_alarm_probability / max(n_tests, 1)
         chances = {observable: self.null.chance(observable) for observable in self.observables}
@@ -373,7 +373,7 @@ def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
     reserved = DECISION.questions.within * allowed if is_shared else 0.0
     if step is not None:
         probability = reserved if rise is not None else allowed - reserved
-        key = step_key(leak.provider)
+        key = STEP_KEY.format(leak.provider)
         chance = case.null.calibrate(key, step.chance)
         # the p-value before calibration, which the calibration converts to `probability`
         threshold = step.threshold(case.null.uncalibrated_chance(key, probability))
@@ -387,25 +387,3 @@ def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
         threshold, chance = float(-ndtri(probability)), float(ndtr(-excess))
         tests.append(LeakTest(LEVEL, excess, threshold, chance=chance, probability=probability))
     return tuple(tests)
-
-
-def step_key(provider: str) -> str:
-    """Return the key under which `HealthyNull` stores a detector's test for a step, such as "volume balance: step"."""
-    return f"{provider}: step"
-
-
-def _change_tests(case: Case) -> tuple[LeakTest, ...]:
-    """Make the test for a leak, if any, from the report of a detector that does not measure leakage.
-
-    The detector states no threshold. It is computed as the score with a calibrated p-value equal to the allowed
-    false-alarm probability, assuming that scores are proportional to the logarithm of the detector's p-value.
-    """
-    rarest = case.tested_observable
-    if rarest is None:
-        return ()
-    allowed = case.false_alarm_probability
-    allowed_chance = case.null.uncalibrated_chance(null_key(rarest), allowed)  # p-value that the detector would state
-    rarest_chance = min(max(rarest.chance, 1e-300), 1.0 - 1e-9)  # the logarithm is finite and not 0
-    threshold = max(float(rarest.score * np.log(allowed_chance) / np.log(rarest_chance)), 0.0)
-    name = WITHIN if rarest.onset is not None else AGAINST  # only a change within a recording has an onset
-    return (LeakTest(name, rarest.score, threshold, chance=case.null.chance(rarest), probability=allowed),)

@@ -36,7 +36,7 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.diagnosis.decision.case import Case, HealthyNull, LeakTest, OtherEvent, step_key
+from sealscope.diagnosis.decision.case import STEP_KEY, Case, HealthyNull, LeakTest, OtherEvent
 from sealscope.diagnosis.decision.explanations import LEAK_EVENTS, probability_of
 from sealscope.diagnosis.estimate.interval import WITHIN_95, Estimate
 from sealscope.diagnosis.inference.observable import LeakMeasure, Observable, Observed, Ringing
@@ -104,7 +104,7 @@ def _decide_without_leak(case: Case) -> Evidence:
     judged_bound, max_bound = _bound_and_limit(case, bound)
     verdict: Verdict = NO_LEAK if math.isfinite(judged_bound) and judged_bound <= max_bound else CANNOT_TELL
     fields: dict[str, Any] = {"cause": None if other is None else other.cause}
-    fields |= {"rarest_chance": case.rarest_chance, "rarest_change": case.rarest_change}
+    fields["rarest_chance"], fields["rarest_change"] = case.find_rarest()
     if leak is not None:
         fields |= {
             "bound_lpm": bound * leak.lpm_per_flow if leak.lpm_per_flow is not None and np.isfinite(bound) else None,
@@ -218,7 +218,7 @@ def _findable_step(case: Case) -> float | None:
     test = next((test for test in case.tests if test.name == WITHIN), None)
     if test is None or case.leak is None or case.leak.step is None:
         return None
-    chance = case.null.uncalibrated_chance(step_key(case.leak.provider), test.probability)
+    chance = case.null.uncalibrated_chance(STEP_KEY.format(case.leak.provider), test.probability)
     return case.leak.step.detectable_step(chance) * case.leak.flow_per_conductance
 
 
@@ -440,7 +440,7 @@ def _rivals_text(case: Case, alarm: LeakTest) -> str:
     `events.toml` is described; of an event without a cause only its time, if known.
     """
     leak_probability = case.leak_probability(alarm)
-    best = next((explanation for explanation in case.explanations if not explanation.has(*LEAK_EVENTS)), None)
+    best = next((explanation for explanation in case.explanations if not explanation.has(LEAK_EVENTS)), None)
     if best is None:
         return ""
     event = best.events[0]

@@ -21,11 +21,12 @@ Source: T. Sellke, M. J. Bayarri, J. O. Berger, The American Statistician 55 (20
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib.resources import files
 from itertools import combinations, product
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -36,6 +37,9 @@ from sealscope.diagnosis.inference.hypotheses import temper
 from sealscope.diagnosis.inference.observable import LeakRise, Observable
 from sealscope.diagnosis.priors.decision import DECISION
 
+#: What an event does to an observable: it moves it, multiplies both pressures by one factor, or disturbs it aside.
+Effect = Literal["moves", "scales", "disturbs"]
+
 
 @dataclass(frozen=True)
 class Event:
@@ -44,35 +48,13 @@ class Event:
     name: str  # such as "piston leak" or "pump wear"
     cause: str | None  # heading under which a verdict names the event, None if no verdict names it
     probability: float  # prior probability that it begins within a recording
-    affected: tuple[str, ...]  # patterns "data: name" of the observables that it changes
-    scaled: tuple[str, ...]  # patterns of observables that it changes by multiplying both pressures by one factor
-    disturbed: tuple[str, ...]  # patterns of observables that it may change as a side effect
+    patterns: Mapping[Effect, tuple[str, ...]]  # patterns "data: name" of the observables on which it has each effect
     description: str  # phrase for what it changes, used in a verdict's reason: "the external leakage on side A"
 
-    @property
-    def is_sized(self) -> bool:
-        """True if priors on the size of a change (in `Observable.advantage`) count for the event.
-
-        They hold for the causes that a verdict names. An event without a cause, such as unsteady motion that looks like
-        free air, may be of any size.
-        """
-        return self.cause is not None
-
-    def affects(self, observable: Observable) -> bool:
-        """Return True if the patterns `affected` state that the event changes an observable."""
-        return _matches(f"{observable.data}: {observable.name}", self.affected)
-
-    def scales(self, observable: Observable) -> bool:
-        """Return True if the event changes an observable by multiplying both pressures by one factor (`scaled`)."""
-        return _matches(f"{observable.data}: {observable.name}", self.scaled)
-
-    def changes(self, observable: Observable) -> bool:
-        """Return True if the event changes an observable, by itself (`affects`) or by scaling pressures (`scales`)."""
-        return self.affects(observable) or self.scales(observable)
-
-    def may_disturb(self, observable: Observable) -> bool:
-        """Return True if the patterns `disturbed` state that the event may change an observable as a side effect."""
-        return _matches(f"{observable.data}: {observable.name}", self.disturbed)
+    def changes(self, observable: Observable, *effects: Effect) -> bool:
+        """Return True if the event has one of the `effects` on an observable, by default if it moves or scales it."""
+        key = f"{observable.data}: {observable.name}"
+        return any(_matches(key, self.patterns[effect]) for effect in effects or ("moves", "scales"))
 
 
 @lru_cache(maxsize=4096)
@@ -90,9 +72,7 @@ def load_events() -> Sequence[Event]:
             name,
             cause=row["cause"] or None,
             probability=row["probability"]["value"],
-            affected=tuple(row["moves"]),
-            scaled=tuple(row.get("scales", ())),
-            disturbed=tuple(row.get("disturbs", ())),
+            patterns={effect: tuple(row.get(effect, ())) for effect in get_args(Effect)},
             description=row["words"],
         )
         for name, row in rows.items()
@@ -118,13 +98,9 @@ class Explanation:
     data: frozenset[str] = frozenset()  # kinds of data (`Observable.data`) in which the set explains a change
     odds: float = 0.0  # posterior probability of the set over the probability that no event has happened
 
-    def has(self, *names: str) -> bool:
-        """Return True if this set of events contains one with any of the `names`."""
-        return any(event.name in names for event in self.events)
-
-    def has_cause(self, *causes: str) -> bool:
-        """Return True if this set of events contains one with any of the `causes`."""
-        return any(event.cause in causes for event in self.events)
+    def has(self, names: Container[str], causes: Container[str | None] = ()) -> bool:
+        """Return True if this set of events contains one with any of the `names` or of the `causes`."""
+        return any(event.name in names or event.cause in causes for event in self.events)
 
 
 #: Log Bayes factors of an event by kind of data.
@@ -145,7 +121,9 @@ def explain(
     """
     events = load_events()
     log_factors = [(observable, _log_factor(observable, chance(observable), rise)) for observable in observables]
-    factors = _compare_by_likelihood(_correct_for_misfit(log_factors))
+    # tempered by the largest factor of the same data
+    largest, misfit = _largest_by_data(log_factors), DECISION.explanation.misfit
+    factors = _compare_by_likelihood([(test, temper(gain, largest[test.data], misfit)) for test, gain in log_factors])
     gains_of = {event.name: _possible_gains(event, factors, rise) for event in events}  # log Bayes factors
     supported = [
         event for event in events if max(sum(gains.values()) for gains in gains_of[event.name]) > MIN_LOG_FACTOR
@@ -184,12 +162,6 @@ def _compare_by_likelihood(log_factors: Sequence[tuple[Observable, float]]) -> l
         is_term = observable.data == VOLUMES
         factors.append((observable, max(best_factor - deficit, 0.0) if is_term else factor))
     return factors
-
-
-def _correct_for_misfit(log_factors: Sequence[tuple[Observable, float]]) -> list[tuple[Observable, float]]:
-    """Temper log Bayes factors by the largest factor of the same data (`temper`)."""
-    max_factors, misfit = _largest_by_data(log_factors), DECISION.explanation.misfit
-    return [(test, temper(factor, max_factors[test.data], misfit)) for test, factor in log_factors]
 
 
 def _largest_by_data(log_factors: Sequence[tuple[Observable, float]]) -> dict[str, float]:
@@ -248,15 +220,17 @@ def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -
     size, over
 
     - observables that the event affects, or changes by a common scale of both pressures (`_agree_on_scale`);
-    - side effects (`Event.may_disturb`) on kinds of data in which no observable of the first group has a log factor
-      above `MIN_LOG_FACTOR`, if one of another kind does. Their log factors are limited to the largest one of the first
-      group: a much clearer change has another cause.
+    - side effects ("disturbs" of `Event.patterns`) on kinds of data in which no observable of the first group has a log
+      factor above `MIN_LOG_FACTOR`, if one of another kind does. Their log factors are limited to the largest one of
+      the first group: a much clearer change has another cause.
 
     The observable of the first group with the largest log factor gives the time of the event; only changes that may be
     of that time count.
     """
-    affected = [(observable, gain) for observable, gain in factors if event.affects(observable)]
-    affected += _agree_on_scale([(observable, gain) for observable, gain in factors if event.scales(observable)])
+    affected = [(observable, gain) for observable, gain in factors if event.changes(observable, "moves")]
+    affected += _agree_on_scale(
+        [(observable, gain) for observable, gain in factors if event.changes(observable, "scales")]
+    )
     if not affected:
         return {}
     clearest, best_gain = max(affected, key=lambda pair: pair[1])
@@ -264,13 +238,16 @@ def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -
     side_effects = [
         (observable, min(gain, best_gain))
         for observable, gain in factors
-        if supporting_data and observable.data not in supporting_data and event.may_disturb(observable)
+        if supporting_data and observable.data not in supporting_data and event.changes(observable, "disturbs")
     ]
     gains: dict[str, float] = {}
     for observable, gain in affected + side_effects:
-        if _coincide(observable, clearest):
-            # advantage: twice the log odds that follow from the prior on the event's size
-            size_log_odds = 0.5 * observable.advantage if event.is_sized else 0.0
+        onsets = [test.onset for test in (observable, clearest) if test.onset is not None]
+        max_distance = 0.5 * sum(onset.high - onset.low for onset in onsets)  # of the 95 % intervals
+        if len(onsets) < 2 or abs(onsets[0].value - onsets[1].value) <= max_distance:
+            # advantage: twice the log odds by the prior on the event's size. An event without a cause, such as unsteady
+            # motion that looks like free air, may be of any size
+            size_log_odds = 0.5 * observable.advantage if event.cause is not None else 0.0
             gains[observable.data] = max(gain + size_log_odds, gains.get(observable.data, 0.0))
     return gains
 
@@ -319,15 +296,6 @@ def log_bayes_factor(chance: float) -> float:
     return -float(np.log(-np.e * chance * np.log(chance)))
 
 
-def _coincide(observable: Observable, anchor: Observable) -> bool:
-    """Return True if two observables may have changed at the same time: an onset is unknown, or the two are near."""
-    if observable.onset is None or anchor.onset is None:
-        return True
-    # half the sum of the widths of the 95 % intervals
-    max_distance = 0.5 * (observable.onset.high - observable.onset.low + anchor.onset.high - anchor.onset.low)
-    return abs(observable.onset.value - anchor.onset.value) <= max_distance
-
-
 def probability_of(
     explanations: Sequence[Explanation], *names: str, causes: Sequence[str] = (), data_kind: str | None = None
 ) -> float:
@@ -338,9 +306,7 @@ def probability_of(
     """
     relevant = [explanation for explanation in explanations if data_kind is None or data_kind in explanation.data]
     total = sum(explanation.probability for explanation in relevant)
-    matching = sum(
-        explanation.probability for explanation in relevant if explanation.has(*names) or explanation.has_cause(*causes)
-    )
+    matching = sum(explanation.probability for explanation in relevant if explanation.has(names, causes))
     return float(matching / total) if total > 0.0 else 0.0
 
 
@@ -353,5 +319,5 @@ def probability_against_chance(explanations: Sequence[Explanation], causes: Sequ
         probability = sum of the odds of sets with such an event / (1 + sum of the odds of all these sets).
     """
     relevant = [explanation for explanation in explanations if data_kind in explanation.data]
-    matching = sum(explanation.odds for explanation in relevant if explanation.has_cause(*causes))
+    matching = sum(explanation.odds for explanation in relevant if explanation.has((), causes))
     return float(matching / (1.0 + sum(explanation.odds for explanation in relevant)))

@@ -29,14 +29,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from sealscope.diagnosis.decision.case import HealthyNull, comparison_key, null_key, step_key
+from sealscope.diagnosis.decision.case import STEP_KEY, HealthyNull
 from sealscope.diagnosis.detectors.isolation import call_plug_in
 from sealscope.diagnosis.estimate.interval import Interval
 from sealscope.diagnosis.healthy import Healthy, healthy_summaries, keep_once, learn_once
 from sealscope.diagnosis.inference.changes.features import SIGNALS, observe_signals
 from sealscope.diagnosis.inference.changes.healthy_levels import HealthyLevels
 from sealscope.diagnosis.inference.hypotheses import Valves
-from sealscope.diagnosis.inference.observable import Observable, Observed
+from sealscope.diagnosis.inference.observable import COMPARISON_KEY, Observable, Observed
 from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.rms_change.rms_detector import DetailSummary, RmsChange, compare_summaries, has_same_rate
 from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE, RMS_CHANGE, VOLUME_BALANCE
@@ -375,7 +375,7 @@ def _unusable_baseline(detector: Detector, healthy: Healthy) -> str | None:
 
 
 def healthy_surprisals(recording: Recording, rig: Rig, valves: Valves = Valves.OPEN) -> Mapping[str, float]:
-    """Compute the surprisal of each change within a healthy recording, by its key (`case.null_key`); cached.
+    """Compute the surprisal of each change within a healthy recording, by its key (`Observable.key`); cached.
 
     `valves`: those that are assumed at rest, open or shut.
     """
@@ -416,19 +416,20 @@ def _max_surprisals(report: Observed) -> dict[str, float]:
     surprisals: dict[str, float] = {}
     for observable in report.observables:
         if observable.onset is not None:  # otherwise a comparison with other recordings
-            key = null_key(observable)
+            key = observable.key
             surprisals[key] = max(observable.surprisal, surprisals.get(key, 0.0))
     if report.leak is not None and report.leak.step is not None:
-        surprisals[step_key(report.provider)] = -float(np.log(max(report.leak.step.chance, _MIN_CHANCE)))
+        surprisals[STEP_KEY.format(report.provider)] = -float(np.log(max(report.leak.step.chance, _MIN_CHANCE)))
     return surprisals
 
 
 def healthy_null(baseline: Sequence[Healthy], rig: Rig, valves: Valves = Valves.OPEN) -> HealthyNull:
     """Collect the surprisals of all tests in healthy recordings, as the null distributions of the tests.
 
-    Each test for a change within a recording has a list (`null_key`) with one value from each recording. Comparisons
-    with other recordings share one list for each kind of data (`comparison_key`): each recording is compared with all
-    others, and the largest surprisal counts. `valves`: those that the volume balance assumes at rest, open or shut.
+    Each test for a change within a recording has a list (`Observable.key`) with one value from each recording.
+    Comparisons with other recordings share one list for each kind of data (`COMPARISON_KEY`): each recording is
+    compared with all others, and the largest surprisal counts. `valves`: those that the volume balance assumes at rest,
+    open or shut.
     """
     surprisals_by_key = defaultdict[str, list[float]](list)
     for healthy in baseline:
@@ -445,7 +446,7 @@ def healthy_null(baseline: Sequence[Healthy], rig: Rig, valves: Valves = Valves.
     comparisons = keep_once(content, lambda: list(map(_rarest, compare_healthy(summaries))))
     for rarest in comparisons:
         for data, surprisal in rarest.items():
-            surprisals_by_key[comparison_key(data)].append(surprisal)
+            surprisals_by_key[COMPARISON_KEY.format(data)].append(surprisal)
     return HealthyNull(surprisals_by_key)
 
 

@@ -23,6 +23,9 @@ from sealscope.diagnosis.priors.inference import StepSize
 from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak, TotalLeakage
 from sealscope.signals.smoothing import TINY
 
+#: Key of the comparisons of a kind of data with healthy recordings (`Observable.key`).
+COMPARISON_KEY = "{}: against"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Observable:
@@ -63,6 +66,14 @@ class Observable:
     advantage: float = 0.0
     log_ratio_to_leak: float | None = None
     pressure_scale: Estimate | None = None
+
+    @property
+    def key(self) -> str:
+        """Key of the test among those of healthy recordings, such as "noise: noise of the pressures".
+
+        Observables without an onset are comparisons with healthy recordings, and share one key for their kind of data.
+        """
+        return COMPARISON_KEY.format(self.data) if self.onset is None else f"{self.data}: {self.name}"
 
     @property
     def surprisal(self) -> float:

@@ -83,11 +83,11 @@ def explain_rise(observables: Sequence[Observable], data: str, onset: Interval, 
     # only sets of events that explain a change of the leakage
     explanations = [explanation for explanation in explain(at_onset) if data in explanation.data]
     if probability_of(explanations, *leak_names) > _MIN_PROBABILITY.leak:
-        if not any(event.affects(change) for event in leak_events for change in significant_changes):
+        if not any(event.changes(change, "moves") for event in leak_events for change in significant_changes):
             return UNKNOWN
         is_outside = probability_of(explanations, causes=[OUTSIDE]) > _MIN_PROBABILITY.named
         return RiseExplanation(is_leak=True, is_outside=is_outside)
-    without_leak = [explanation for explanation in explanations if not explanation.has(*ALARMING)]
+    without_leak = [explanation for explanation in explanations if not explanation.has(ALARMING)]
     if not without_leak or not significant_changes:
         return UNKNOWN
     most_probable, *_ = without_leak  # sorted by probability
