@@ -69,7 +69,9 @@ def atomic_write(path: str | os.PathLike[str], like: Path | None = None) -> Iter
         _sync(temporary, os.O_RDWR)  # Windows syncs only what is open for writing
         present = next((file for file in (like, target) if file is not None and file.exists()), None)
         if present is None:
-            temporary.chmod(_new_file_mode())
+            mask = os.umask(0)  # the mask can be read only by setting it
+            os.umask(mask)
+            temporary.chmod(0o666 & ~mask)
         else:
             copy_access(present, temporary, name=target)
         temporary.replace(target)
@@ -100,13 +102,6 @@ def copy_access(source: Path, file: Path, name: Path | None = None) -> None:
             _log.warning("%s now belongs to user %d, no more to %d", name or file, present.st_uid, status.st_uid)
     if present.st_mode & 0o777 != status.st_mode & 0o777:
         file.chmod(status.st_mode & 0o777)
-
-
-def _new_file_mode() -> int:
-    """Return the permission bits of a new file, by the umask of this process."""
-    mask = os.umask(0)  # the mask can be read only by setting it
-    os.umask(mask)
-    return 0o666 & ~mask
 
 
 def _sync(path: Path, flags: int) -> None:

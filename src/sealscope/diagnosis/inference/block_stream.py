@@ -458,7 +458,15 @@ class SignEvidence(SavedAttributes):
             self._columns, self._grams, self._counts, self._motions, self._loads, strict=True
         ):
             motion_z = z_score(*motions[0].tolist()) if roles.piston else 0.0
-            leak_z = _leak_z_score(gram, roles, int(count))
+            nuisance = [k for k in roles.nuisance if k != roles.leak]
+            leak = Gaussian.from_gram(gram).marginal([roles.leak], nuisance)
+            energy, moment, whole_energy = (
+                float(leak.precision[0, 0]),
+                float(leak.moment[0]),
+                float(gram[roles.leak, roles.leak]),
+            )
+            freedom = float(int(count) - len(nuisance) - 1)
+            leak_z = leak_score(energy, moment, leak.square, whole_energy, freedom)
             difference_sums, force_sums = loads.tolist()
             odds_by_balance.append(sum_log_odds(leak_z, difference_sums, force_sums, motion_z))
         return tuple(odds_by_balance)
@@ -488,16 +496,3 @@ def _load_pressure(rows: Array, columns: ColumnRoles, area_ratio: float) -> Arra
         return np.asarray(rows[:, columns.leak])
     p_A, negative_p_B = (rows[:, columns.names.index(name)] for name in names)
     return np.asarray(p_A + area_ratio * negative_p_B)
-
-
-def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
-    """Compute the z score of the leak's coefficient (`sum_log_odds`); `gram` (m, m): of the `n_rows` rows."""
-    nuisance = [k for k in roles.nuisance if k != roles.leak]
-    leak = Gaussian.from_gram(gram).marginal([roles.leak], nuisance)
-    energy, moment, whole_energy = (
-        float(leak.precision[0, 0]),
-        float(leak.moment[0]),
-        float(gram[roles.leak, roles.leak]),
-    )
-    freedom = float(n_rows - len(nuisance) - 1)
-    return leak_score(energy, moment, leak.square, whole_energy, freedom)

@@ -135,11 +135,6 @@ def add_pump_columns(gram: Array, names: Sequence[str]) -> Array:
     return expanded
 
 
-def has_rests(blocks: Blocks, roles: ColumnRoles) -> bool:
-    """Return True if pump or piston rest under pressure at times; `roles` include those of `balances.with_rests`."""
-    return _rest_share(blocks, roles, TURNING) > NEGLIGIBLE
-
-
 def _rest_share(blocks: Blocks, roles: ColumnRoles, *states: str) -> float:
     """Compute the fraction of the sum of squares of p_A - p_B outside the given states of the machine.
 
@@ -381,7 +376,7 @@ def recorded_blocks(recording: Recording, rig: Rig, healthy_holds: HoldCounts | 
     )
     open_blocks = partial(compute_regime_blocks, valves=Valves.OPEN)
     open_regime = _build_regime(balances, open_blocks, ratio_deviation)._replace(**delays)
-    if not may_shut or not has_rests(recorded, columns):
+    if not may_shut or not (_rest_share(recorded, columns, TURNING) > NEGLIGIBLE):
         return RecordedBlocks(open_regime, None, 0.0, stream.sign_log_odds, holds)
     shut_balances = tuple(shut_at_rest(balance) for balance in balances)
     shut = Valves.SURELY_SHUT if odds > INFERENCE.rest.sure_odds else Valves.SHUT

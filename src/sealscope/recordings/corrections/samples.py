@@ -317,7 +317,13 @@ def unwrap_angles(recording: Recording) -> tuple[Recording, list[Finding]]:
     }
     angle = unwrap_angle(recording["theta"], recording.units["theta"], recording.t, signals)
     if angle is None:
-        return _continue_resets(recording)
+        values, resets = continue_resets(recording["theta"], recording.channels.get("x"))
+        if not resets.size:
+            return recording, []
+        text = f"theta: begins again from its first value, {format_count(resets.size, 'time')}: taken as continuing"
+        places = locate_rows(recording.t, resets)
+        finding = Finding("angle_reset", "note", "theta", int(resets.size), float(recording.t[resets[0]]), text, places)
+        return replace(recording, channels={**recording.channels, "theta": values}), [finding]
     period = recording.format_value("theta", angle.period, is_span=True)
     leaps, places = format_count(angle.leaps.size, "time"), locate_rows(recording.t, angle.leaps)
     if angle.values is None:
@@ -328,17 +334,6 @@ def unwrap_angles(recording: Recording) -> tuple[Recording, list[Finding]]:
     text = f"theta: begins anew after {period}, {leaps}: unwrapped"
     finding = Finding("angle_unwrapped", "note", "theta", angle.leaps.size, places[0], text, places)
     return replace(recording, channels={**recording.channels, "theta": angle.values}), [finding]
-
-
-def _continue_resets(recording: Recording) -> tuple[Recording, list[Finding]]:
-    """Let theta continue where the encoder begins again from its first value; also return a finding."""
-    values, resets = continue_resets(recording["theta"], recording.channels.get("x"))
-    if not resets.size:
-        return recording, []
-    text = f"theta: begins again from its first value, {format_count(resets.size, 'time')}: taken as continuing"
-    places = locate_rows(recording.t, resets)
-    finding = Finding("angle_reset", "note", "theta", int(resets.size), float(recording.t[resets[0]]), text, places)
-    return replace(recording, channels={**recording.channels, "theta": values}), [finding]
 
 
 class CorrectedSamples(NamedTuple):

@@ -55,7 +55,8 @@ def restore_signs(recording: Recording) -> tuple[Recording, list[Finding]]:
         if name not in recording:
             continue
         values = recording[name]
-        is_one_way = _has_one_sign(values)
+        ends = finite_range(values)
+        is_one_way = ends is not None and is_one_sided(*ends)
         if not is_one_way and _moves_both_ways(values):
             continue
         motion = _motion(recording)
@@ -178,12 +179,6 @@ def restore_flow(values: Array, x: Array, difference: Array, rate: float, flow_p
     speed = _piston_speed(x, rate)
     sign = _fit_signs(difference, speed, np.abs(values), rate, np.array(flow_per_speed))
     return _draw_noise_signs(main_side * values, rate) * sign
-
-
-def _has_one_sign(values: Array) -> bool:
-    """Test whether a channel (n,) stays on one side of zero (`is_one_sided`)."""
-    ends = finite_range(values)
-    return ends is not None and is_one_sided(*ends)
 
 
 def _find_sign(recording: Recording, magnitude: Array) -> tuple[Array | None, str]:

@@ -542,7 +542,9 @@ def _apply_names(choice: ColumnMap, labels: Sequence[Label]) -> None:
             if choice.labels[column].name != channel:
                 choice.names[channel] = labels[column].whole
             choice.notes += [note] if note else []
-    _check_actuator(choice.labels, embedded)
+    actuators = find_actuators(choice.labels) if len(embedded) > 1 else None
+    if actuators is not None and actuators.names and not actuators.find_containing(embedded):
+        raise InputError(actuators.question())
     if choice.time is None and (time := _find_time(labels)) is not None:
         label = labels[time]
         unit_of_name = label.unit or WORDS["time"].get(label.name.casefold()) or unit_of_time(label)
@@ -578,13 +580,6 @@ def _select_actuator(choice: ColumnMap, request: Request, mapped_columns: Contai
     if left_out:
         choice.notes.append(f"columns of {actuators.names[number]} read, not {join_names(left_out, 6)}")
     return selected
-
-
-def _check_actuator(labels: Sequence[Label], columns: Sequence[int]) -> None:
-    """Raise InputError if `columns` whose names contain a channel's, as `Boom.p_A`, are those of several actuators."""
-    actuators = find_actuators(labels) if len(columns) > 1 else None
-    if actuators is not None and actuators.names and not actuators.find_containing(columns):
-        raise InputError(actuators.question())
 
 
 def _find_embedded_name(labels: Sequence[Label], channel: str) -> int | None:
