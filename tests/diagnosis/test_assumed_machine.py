@@ -118,7 +118,7 @@ def test_who_states_the_machine() -> None:
         known, assumed = assumed_rig(rig, recording)
         assert assumed.stated_by == who
         assert known.states("cylinder.M_eq") == (who != "nobody")
-    assert (assumed.area_stated, assumed.displacement_stated, assumed.stated) == (True, False, False)
+    assert (assumed.area_stated, assumed.displacement_stated, assumed.has_stated_sizes) == (True, False, False)
     assert assumed.area == pytest.approx(9e-4)
 
 

@@ -36,7 +36,7 @@ def test_the_odds_of_the_valves_add_up_within_what_one_recording_may_tell() -> N
 
 
 def test_residuals_that_repeat_count_as_few() -> None:
-    n = INFERENCE.size.readings
+    n = INFERENCE.tempering.readings
     assert compare_residuals(2.0, 2.0) == 0.0
     assert compare_residuals(1.0, math.e) == pytest.approx(0.5 * n) == -compare_residuals(math.e, 1.0)
 

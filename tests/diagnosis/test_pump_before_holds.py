@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.estimate.interval import Estimate
-from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks, estimate_pump_leakage
+from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
 from sealscope.diagnosis.inference.circuit.holds.recorded_hold import find_locked_holds
 from sealscope.diagnosis.inference.comparison import RecordingSums, Resistance, held_pump_rise
+from sealscope.diagnosis.inference.volumes.recorded import estimate_pump_leakage
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Recording
 from sealscope.units import P_ATM

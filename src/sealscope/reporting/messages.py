@@ -133,7 +133,7 @@ def _why_no_flow(diagnosis: Diagnosis) -> str:
         return say(f"how_much.{'too_small' if is_too_small else 'channels'}")
     if raw_counts(diagnosis):
         return say("how_much.counts")
-    if diagnosis.machine is None or diagnosis.machine.stated:  # withheld for another reason than unknown sizes
+    if diagnosis.machine is None or diagnosis.machine.has_stated_sizes:  # withheld for another reason than sizes
         return say("how_much.reason")
     # with a measured ratio of displacement to area, the area alone is enough
     return say(f"how_much.{'machine' if diagnosis.measured_ratio is None else 'machine_or_area'}")
@@ -147,7 +147,7 @@ def machine_text(machine: AssumedMachine | None) -> str | None:
         key = "meter"  # of `messages.toml`
     elif machine.stated_by == "recording":
         key = "recording"
-    elif machine.stated:
+    elif machine.has_stated_sizes:
         key = "call" if machine.stated_by == "call" else "stated"
     else:
         key = "area" if machine.area_stated else "displacement" if machine.displacement_stated else "assumed"

@@ -22,6 +22,7 @@ from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.inference.comparison import Rise
 from sealscope.diagnosis.inference.observable import LeakRise, Observable, Observed
 from sealscope.diagnosis.priors.decision import DECISION
+from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.severity import state_of
 
 from .cases import observable
@@ -44,7 +45,7 @@ def test_a_chance_is_worth_the_bound_of_sellke(chance: float) -> None:
 
 def test_rivals_are_told_apart_no_better_than_the_terms_are_known() -> None:
     """However long the recording, the odds of two rivals of the same data end at exp(1 / 4 m)."""
-    misfit = DECISION.explanation.misfit
+    misfit = INFERENCE.tempering.term
     probable = {event.name: event.probability for event in EVENTS.values()}
     for chance in (1e-20, 1e-100, 1e-280):
         rivals = [observable("levels: friction", chance), observable("levels: load", math.sqrt(chance))]
@@ -65,7 +66,7 @@ def test_what_is_not_rare_is_worth_nothing() -> None:
 def test_one_observable_by_hand() -> None:
     """Events that move it earn its Bayes factor, all others their probability, and pairs of the former both."""
     bound = log_bayes_factor(LEAK.chance)
-    factor = math.exp(bound / (1.0 + 2.0 * DECISION.explanation.misfit * bound))
+    factor = math.exp(bound / (1.0 + 2.0 * INFERENCE.tempering.term * bound))
     moving = [event.probability for event in EVENTS.values() if event.changes(LEAK, "moves")]
     silent = sum(event.probability for event in EVENTS.values() if not event.changes(LEAK, "moves"))
     pairs = 0.5 * (sum(moving) ** 2 - sum(p * p for p in moving))
@@ -157,7 +158,7 @@ def test_a_rare_change_with_an_improbable_cause_is_by_chance() -> None:
         assert probability_of(explained, causes=[scale.cause], data_kind="motion") > 0.99
         against_chance = probability_against_chance(explained, ["sensor fault"], "motion")
         bound = log_bayes_factor(chance)
-        odds = scale.probability * math.exp(bound / (1.0 + 2.0 * DECISION.explanation.misfit * bound))
+        odds = scale.probability * math.exp(bound / (1.0 + 2.0 * INFERENCE.tempering.term * bound))
         assert against_chance == pytest.approx(odds / (1.0 + odds), rel=0.1)
         assert (against_chance > DECISION.explanation.happened) == happened
 

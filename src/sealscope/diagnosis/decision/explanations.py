@@ -36,6 +36,7 @@ from sealscope.diagnosis.inference.comparison import RISE
 from sealscope.diagnosis.inference.hypotheses import temper
 from sealscope.diagnosis.inference.observable import LeakRise, Observable
 from sealscope.diagnosis.priors.decision import DECISION
+from sealscope.diagnosis.priors.inference import INFERENCE
 
 #: What an event does to an observable: it moves it, multiplies both pressures by one factor, or disturbs it aside.
 Effect = Literal["moves", "scales", "disturbs"]
@@ -122,8 +123,10 @@ def explain(
     events = load_events()
     log_factors = [(observable, _log_factor(observable, chance(observable), rise)) for observable in observables]
     # tempered by the largest factor of the same data
-    largest, misfit = _largest_by_data(log_factors), DECISION.explanation.misfit
-    factors = _compare_by_likelihood([(test, temper(gain, largest[test.data], misfit)) for test, gain in log_factors])
+    largest = _largest_by_data(log_factors)
+    factors = _compare_by_likelihood(
+        [(test, temper(gain, largest[test.data], INFERENCE.tempering.term)) for test, gain in log_factors]
+    )
     gains_of = {event.name: _possible_gains(event, factors, rise) for event in events}  # log Bayes factors
     supported = [
         event for event in events if max(sum(gains.values()) for gains in gains_of[event.name]) > MIN_LOG_FACTOR
@@ -144,7 +147,7 @@ def _compare_by_likelihood(log_factors: Sequence[tuple[Observable, float]]) -> l
 
     The terms are alternative descriptions of the same residual. A term's log likelihood l is the log Bayes factor of
     its uncalibrated p-value. The best term has the log likelihood L and the calibrated log Bayes factor B. With the
-    relative misfit m of models (`explanation.misfit` in `priors.toml`), each term gets
+    relative misfit m of models (`tempering.term` in `priors.toml`), each term gets
 
         log factor = max(B - (L - l) / (1 + 2 m L), 0).
 
@@ -155,10 +158,11 @@ def _compare_by_likelihood(log_factors: Sequence[tuple[Observable, float]]) -> l
     if not terms:
         return list(log_factors)
     best_likelihood, best_factor = max(terms, key=lambda term: term[0])
-    misfit = DECISION.explanation.misfit
     factors = []
     for observable, factor in log_factors:
-        deficit = temper(best_likelihood - log_bayes_factor(observable.chance), best_likelihood, misfit)
+        deficit = temper(
+            best_likelihood - log_bayes_factor(observable.chance), best_likelihood, INFERENCE.tempering.term
+        )
         is_term = observable.data == VOLUMES
         factors.append((observable, max(best_factor - deficit, 0.0) if is_term else factor))
     return factors

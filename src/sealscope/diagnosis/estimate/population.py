@@ -58,6 +58,12 @@ N_FACTORS, LEAST_WEIGHT = 15, 1e-5
 ROOT_HALF, ROOT_PI = math.sqrt(0.5), math.sqrt(math.pi)
 
 
+def normal_log_density(value: Any, variance: Any) -> Any:
+    """Compute the log density at `value` of a normal distribution with mean 0 and a `variance`, numbers or arrays."""
+    variance = np.maximum(variance, np.finfo(float).tiny)
+    return -0.5 * value * value / variance - 0.5 * np.log(2.0 * np.pi * variance)
+
+
 def weigh_alternatives(log_weights: Array) -> Array:
     """Compute the probabilities of alternatives, of which one is true, from log weights of any sum and shape.
 

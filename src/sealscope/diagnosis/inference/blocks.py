@@ -812,7 +812,7 @@ def offset_penalty(offset: float) -> float:
     """Compute how improbable a sensor offset of p_A - p_B [Pa] is: -2 log of its density over the largest one.
 
     Of a sensor that is far off, the largest density is that of such sensors, times their odds. Penalties of sizes of
-    other changes (`observable.step_penalty`), with which it is compared, are relative to their largest density as well.
+    other changes (`hypotheses.step_penalty`), with which it is compared, are relative to their largest density as well.
     """
     usual, far, odds = INFERENCE.zero.pressure, INFERENCE.zero.far, INFERENCE.zero.odds
     return float(min((offset / usual) ** 2, (offset / far) ** 2 - 2.0 * np.log(odds)))

@@ -29,8 +29,7 @@ from sealscope.diagnosis.estimate.interval import Estimate, Interval
 from sealscope.diagnosis.estimate.linear import Gaussian, solve
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, information
 from sealscope.diagnosis.inference.equations.terms import LAG, ORIFICE, delay_name
-from sealscope.diagnosis.inference.hypotheses import compare_residuals
-from sealscope.diagnosis.inference.observable import step_penalty
+from sealscope.diagnosis.inference.hypotheses import compare_residuals, step_penalty
 from sealscope.diagnosis.inference.rows import half_width
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array

@@ -16,13 +16,14 @@ from their summaries, are the prior of the judged one (`MachineOdds`). The other
 recording.
 
 No model describes a machine exactly, so likelihoods of models are believed less than many data would allow. They are
-tempered in two ways: a residual counts as `size.readings` independent ones (`compare_residuals`), and a logarithm as
-exact to within a relative misfit (`temper`).
+tempered in two ways: a residual counts as `tempering.readings` independent ones (`compare_residuals`), and a logarithm
+as exact to within a relative misfit (`temper`).
 """
 
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -32,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.healthy import Number, Values, stored_array
-from sealscope.diagnosis.priors.inference import INFERENCE
+from sealscope.diagnosis.priors.inference import INFERENCE, StepSize
 from sealscope.recordings.motion import find_runs
 from sealscope.recordings.recording import Array
 
@@ -94,18 +95,29 @@ class Unknown(NamedTuple):
 def compare_residuals(square: float, other: float) -> float:
     """Compute the log likelihood ratio of a description of a volume balance to another, by residual sums of squares.
 
-    It is N/2 log(`other` / `square`) with N = `size.readings` (`priors.toml`): what a balance leaves repeats from cycle
-    to cycle, so that no more residuals count as independent.
+    It is N/2 log(`other` / `square`) with N = `tempering.readings` (`priors.toml`): what a balance leaves repeats from
+    cycle to cycle, so that no more residuals count as independent.
     """
-    return -0.5 * float(INFERENCE.size.readings) * math.log(square / other)
+    return -0.5 * float(INFERENCE.tempering.readings) * math.log(square / other)
 
 
 def temper(log_ratio: Any, largest: float, misfit: float) -> Any:
     """Reduce log likelihood ratios l of models that describe a change only to within a relative `misfit` m.
 
-    The result is l / (1 + 2 m L), where L is the `largest` log likelihood ratio of the same data, at least 0.
+    The result is l / (1 + 2 m L), where L is the `largest` log likelihood ratio of the same data, at least 0. `misfit`:
+    `term` or `pattern` of `[tempering]` (`priors.toml`).
     """
     return log_ratio / (1.0 + 2.0 * misfit * largest)
+
+
+def step_penalty(step: float, prior: StepSize, above: bool = False) -> float:
+    """Compute the penalty -2 log(prior density / largest prior density) for an improbable size of a `step`.
+
+    The prior is normal in log(abs(`step`)) about the logarithm of its `size`, with the standard deviation `spread`.
+    With `above`, only steps larger than this size are penalised.
+    """
+    deviation = math.log(max(abs(step), sys.float_info.min) / prior.size) / prior.spread
+    return max(deviation, 0.0) ** 2 if above else deviation**2
 
 
 #: Prior probability of each law of a leak, by the exponent e of its flow c |p_A - p_B|^e: 1 is laminar, 0.5 an orifice.

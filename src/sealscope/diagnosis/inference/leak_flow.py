@@ -47,11 +47,10 @@ from numpy.typing import NDArray
 from sealscope.diagnosis.estimate.change import Information, StepTest, bound_steps, step_shapes, step_sizes, step_test
 from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.estimate.linear import Gaussian
-from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY, weigh_alternatives
+from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY, normal_log_density, weigh_alternatives
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.equations.terms import HOLDING, ORIFICE, TURNING
 from sealscope.diagnosis.inference.hypotheses import GROWTHS, LAWS
-from sealscope.diagnosis.inference.regimes import normal_log_density
 from sealscope.diagnosis.inference.rows import OVERLAP
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array

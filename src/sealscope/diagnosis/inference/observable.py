@@ -8,7 +8,6 @@ and `decision.decide` weighs the reports.
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
@@ -19,7 +18,6 @@ from sealscope.diagnosis.estimate.change import StepTest
 from sealscope.diagnosis.estimate.interval import Estimate, Interval
 from sealscope.diagnosis.estimate.population import MIN_HEALTHY, ScatterPrior, estimate_variance, predict_estimate
 from sealscope.diagnosis.inference.comparison import Rise
-from sealscope.diagnosis.priors.inference import StepSize
 from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak, TotalLeakage
 from sealscope.signals.smoothing import TINY
 
@@ -105,16 +103,6 @@ class Observable:
             advantage=advantage,
             pressure_scale=pressure_scale,
         )
-
-
-def step_penalty(step: float, prior: StepSize, above: bool = False) -> float:
-    """Compute the penalty -2 log(prior density / largest prior density) for an improbable size of a `step`.
-
-    The prior is normal in log(abs(`step`)) about the logarithm of its `size`, with the standard deviation `spread`.
-    With `above`, only steps larger than this size are penalised.
-    """
-    deviation = math.log(max(abs(step), sys.float_info.min) / prior.size) / prior.spread
-    return max(deviation, 0.0) ** 2 if above else deviation**2
 
 
 #: Flow of a leak that was not tested.

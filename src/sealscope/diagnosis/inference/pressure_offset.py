@@ -13,7 +13,7 @@ curvature). With the variance kappa of the noise and q kappa of the walk in a bl
 F and B are projected out. z maximises its prior times the restricted likelihood, over onsets and (q, kappa). The prior
 is a normal density for good sensors, with small odds of a wide density. The walk may be no larger than the one fitted
 without z; otherwise z and a free walk would describe changes that no leak explains. The residual of the volume balance
-repeats from cycle to cycle, so no more than `size.readings` residuals count as independent. If the leak does not
+repeats from cycle to cycle, so no more than `tempering.readings` residuals count as independent. If the leak does not
 change, there is no information on z. It then stays near zero, and no result depends on it. Behind a servo valve both
 chambers have the same leak, step and z, so their whitened rows are stacked.
 
@@ -115,7 +115,7 @@ def _find_relative_offset(
     walks = WALKS[largest_step_likelihood(leak_steps, residuals)[1] >= WALKS]
 
     # the residual of the balance repeats from cycle to cycle, so not all residuals are independent
-    independent_fraction = min(1.0, INFERENCE.size.readings / len(residuals))
+    independent_fraction = min(1.0, INFERENCE.tempering.readings / len(residuals))
 
     def log_likelihood(positions: Array | float) -> Array:
         """Compute the log likelihoods at asinh(offset) = `positions`, scaled to the number of independent residuals."""

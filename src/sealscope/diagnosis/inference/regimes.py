@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.estimate.linear import Gaussian, solve
+from sealscope.diagnosis.estimate.population import normal_log_density
 from sealscope.diagnosis.inference.block_stream import MAX_BLOCK_TIME, MIN_BLOCK_TIME, BlockStream
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.delays import (
@@ -224,12 +225,6 @@ def fit_with_robust_covariance(gram: Array, columns: list[int], left: int) -> tu
     coefficients = fit.mean
     scores = moments - grams @ coefficients  # (K, c), products of the residual with the columns
     return coefficients, fit.robust_covariance(scores.T @ scores * (len(grams) / (len(grams) - 1.0)))
-
-
-def normal_log_density(value: Any, variance: Any) -> Any:
-    """Compute the log density at `value` of a normal distribution with mean 0 and a `variance`, numbers or arrays."""
-    variance = np.maximum(variance, np.finfo(float).tiny)
-    return -0.5 * value * value / variance - 0.5 * np.log(2.0 * np.pi * variance)
 
 
 _BLOCKS = INFERENCE.blocks

@@ -24,7 +24,6 @@ class PressureLevelPriors(PriorTable):
     least: float  # smallest fraction of a block's time that the machine must move in each direction
     slowest: float  # lowest speed that counts as motion, over the highest speed
     freedom: float  # degrees of freedom of the t distribution of the differences between blocks
-    misfit: float  # relative error with which a pattern (levels that one cause changes) describes a step
 
 
 class HealthyLevelPriors(PriorTable):

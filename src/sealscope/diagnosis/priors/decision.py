@@ -40,7 +40,6 @@ class ExplanationPriors(PriorTable):
     happened: float  # the same if the change may also be pure chance; both limits must be exceeded
     sure: float  # a leak, or another event, is excluded if its probability is below 1 - `sure`
     combined: float  # smallest logarithm of the Bayes factor with which an event is combined with others
-    misfit: float  # relative error with which a term of the model describes the data, by which evidence is limited
     scale: float  # relative error of a common factor on both pressures, as computed from leakage, friction or noise
 
 

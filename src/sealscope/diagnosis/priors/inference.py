@@ -99,10 +99,17 @@ class SizePriors(PriorTable):
     usual: float  # scale of the prior on the flow of a leak, over the pump's flow
     present: float  # prior probability that there is a leak in a recording
     within: float  # prior probability that a leak began within the recording, not before
-    readings: int  # number of independent residuals by which a recording tells the leak's law
     meter: float  # scale of a flow meter
     area: float  # piston area
     creep: float  # flow of a leak, estimated from the creep of a held load
+
+
+class TemperingPriors(PriorTable):
+    """How far likelihoods of models are believed, as no model describes a machine exactly."""
+
+    term: float  # relative misfit of a term or an event to what it explains
+    pattern: float  # relative misfit of a pattern (levels that one cause changes) to a step
+    readings: int  # number of independent readings as which the residuals of a volume balance count
 
 
 class TotalPriors(PriorTable):
@@ -294,6 +301,7 @@ class InferencePriors(PriorTable):
     conditions: ConditionPriors
     oil: OilPriors
     size: SizePriors
+    tempering: TemperingPriors
     total: TotalPriors
     repeats: RepeatPriors
     growth: GrowthPriors

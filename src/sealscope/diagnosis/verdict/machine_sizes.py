@@ -52,7 +52,7 @@ class AssumedMachine:
     bypass: bool = False
 
     @property
-    def stated(self) -> bool:
+    def has_stated_sizes(self) -> bool:
         """True if area and displacement are both stated, and not merely assumed."""
         return self.area_stated and self.displacement_stated
 

@@ -35,8 +35,9 @@ from sealscope.diagnosis.inference.changes.motion_fit import (
     solve_weighted,
     stack_equations,
 )
+from sealscope.diagnosis.inference.hypotheses import step_penalty
 from sealscope.diagnosis.inference.machine_states import find_rests
-from sealscope.diagnosis.inference.observable import Observable, compare_estimates, step_penalty
+from sealscope.diagnosis.inference.observable import Observable, compare_estimates
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.channels import flow_source
 from sealscope.recordings.recording import Array, Recording, compute_once

@@ -63,8 +63,9 @@ from sealscope.diagnosis.inference.changes.motion_fit import (
     select_motion,
 )
 from sealscope.diagnosis.inference.equations.terms import Signals
+from sealscope.diagnosis.inference.hypotheses import step_penalty
 from sealscope.diagnosis.inference.machine_states import MIN_REST, flag_lowering, number_strokes, rest_limit
-from sealscope.diagnosis.inference.observable import Observable, compare_estimates, step_penalty
+from sealscope.diagnosis.inference.observable import Observable, compare_estimates
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.channels import CHAMBERS, flow_source
 from sealscope.recordings.recording import Array, Recording

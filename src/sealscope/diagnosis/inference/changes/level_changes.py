@@ -19,7 +19,7 @@ that step, minus 1:
 A pattern explains nothing of the other directions. Patterns are therefore compared by the likelihood of all c numbers
 together, with one variance v: the sum over directions of the residual variance, with the step in those of the pattern
 only. In c n numbers, with the largest log likelihood ratio L = c n / 2 log(v without a step / v) over all onsets and
-the relative misfit e of a pattern (`levels.misfit` in `priors.toml`),
+the relative misfit e of a pattern (`tempering.pattern` in `priors.toml`),
 
     rank = 2 L / (1 + 2 e L) - (m - 1) log n.
 
@@ -41,6 +41,7 @@ from sealscope.diagnosis.inference.equations.terms import HALF_DIFFERENCE, centr
 from sealscope.diagnosis.inference.hypotheses import temper
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.priors.changes import CHANGES
+from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.motion import find_cycle
 from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.smoothing import TINY, quantiles
@@ -394,7 +395,7 @@ def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> Obser
     best = int(np.argmax(log_ratios))
     log_ratio = float(log_ratios[best])
     # a pattern describes the levels only approximately
-    rank = 2.0 * temper(log_ratio, log_ratio, _PRIORS.misfit) - (n_directions - 1) * math.log(n_blocks)
+    rank = 2.0 * temper(log_ratio, log_ratio, INFERENCE.tempering.pattern) - (n_directions - 1) * math.log(n_blocks)
     # sum over the pattern's directions of F = variance without a step / variance with it - 1
     gains = np.log1p((variance_without[:n_directions, None] / variance - 1.0).sum(axis=0))
     score = n_blocks * float(gains.max())

@@ -38,9 +38,9 @@ from sealscope.diagnosis.inference.equations.terms import (
     Term,
     delay_name,
 )
-from sealscope.diagnosis.inference.hypotheses import LAWS
+from sealscope.diagnosis.inference.hypotheses import LAWS, step_penalty
 from sealscope.diagnosis.inference.leak_flow import apparent_conductances
-from sealscope.diagnosis.inference.observable import Observable, step_penalty
+from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 

@@ -41,13 +41,12 @@ from sealscope.diagnosis.inference.comparison import (
 )
 from sealscope.diagnosis.inference.equations.balances import READ, circulation, equations, locked, shut_at_rest
 from sealscope.diagnosis.inference.equations.terms import AIR, HOLDING, LEAK, SPEED_LOSS, TURNING, Flow
-from sealscope.diagnosis.inference.hypotheses import PRIOR_ODDS, VALVES, HoldCounts, MachineOdds, Valves
+from sealscope.diagnosis.inference.hypotheses import PRIOR_ODDS, VALVES, HoldCounts, MachineOdds, Valves, step_penalty
 from sealscope.diagnosis.inference.observable import (
     Observable,
     Observed,
     compare_estimates,
     compare_with_healthy,
-    step_penalty,
 )
 from sealscope.diagnosis.inference.regimes import RecordedBlocks, RegimeBlocks, add_pump_columns, recorded_blocks
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
