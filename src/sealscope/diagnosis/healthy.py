@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple, Protocol
 import numpy as np
 
 from sealscope.compiled import cache_directory
-from sealscope.recordings.recording import Array, Recording, compute_once
+from sealscope.recordings.recording import Array, Recording, compute_once, keep_with_recording
 from sealscope.storage.kept_results import MISSING, SUFFIX, keep_result, plain_json, remove_oldest, restore_result
 
 if TYPE_CHECKING:
@@ -202,7 +202,7 @@ def learn_once(
         """Restore the result from disk, or compute and keep it."""
         assumed = None if rig is None else rig.as_dict()
         return _restore_or_compute(
-            lambda: json.dumps([_digest(samples), key, assumed], default=str), lambda: compute(samples)
+            lambda: json.dumps([_compute_digest(samples), key, assumed], default=str), lambda: compute(samples)
         )
 
     return compute_once(recording, (*key, rig), restore_or_compute)
@@ -226,13 +226,9 @@ def _restore_or_compute(content: Callable[[], str], compute: Callable[[], _T]) -
     return result  # type: ignore[no-any-return]
 
 
-def _digest(recording: Recording) -> str:
-    """Compute the SHA-256 of all that a recording holds, in hexadecimal digits; the result is cached with it."""
-    return compute_once(recording, ("content",), _compute_digest)
-
-
+@keep_with_recording
 def _compute_digest(recording: Recording) -> str:
-    """Compute the SHA-256 of the samples, units, rate, origin and history of a recording."""
+    """Compute the SHA-256 of all that a recording holds, samples, units, rate, origin and history, in hexadecimal."""
     content = sha256(recording.t.tobytes())
     for values in recording.channels.values():
         content.update(values.tobytes())

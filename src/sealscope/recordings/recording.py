@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import wraps
 from html import escape
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
     from sealscope.recordings.formats.table import RecordingFields
 
-__all__ = ["CHANNEL_UNITS", "COUNTS", "Array", "Recording", "compute_once", "make_recording"]
+__all__ = ["CHANNEL_UNITS", "COUNTS", "Array", "Recording", "compute_once", "keep_with_recording", "make_recording"]
 
 _T = TypeVar("_T")
 #: Unit of a channel -> unit in which it is drawn if its log states none.
@@ -375,3 +376,14 @@ def compute_once(
     if (key, names) not in recording._results:
         recording._results[key, names] = compute(recording)
     return recording._results[key, names]  # type: ignore[no-any-return]
+
+
+def keep_with_recording(compute: Callable[[Recording], _T]) -> Callable[[Recording], _T]:
+    """Let a function of a recording compute its result once, and cache it with the recording (`compute_once`)."""
+
+    @wraps(compute)
+    def restore(recording: Recording) -> _T:
+        """Restore the result, or compute it."""
+        return compute_once(recording, (compute.__module__, compute.__qualname__), compute)
+
+    return restore

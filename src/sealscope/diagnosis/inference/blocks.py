@@ -528,7 +528,7 @@ def _build_normal_equations(
     `test`, `left`: indices of the nuisance columns, of the tested one and of the left side.
     """
     sums, size = _Sums.allocate(len(gram), (len(nuisance) + 1) * polynomials.shape[1]), polynomials.shape[1]
-    blocks, factors = np.ascontiguousarray(gram), np.ascontiguousarray(polynomials)  # as in `_fit_equation_once`
+    blocks, factors = np.ascontiguousarray(gram), np.ascontiguousarray(polynomials)  # as in `_fit_equation`
     _sum_products(blocks, factors, np.array(nuisance, np.int64), (test, left, -1), 0.0, np.zeros(len(gram)), 0, sums)
     normal = sums.normal_equations(gram, left)  # last are the columns of the offset, which are zero
     nuisance_sums = Gaussian(
@@ -740,21 +740,16 @@ class _EquationFit(NamedTuple):
         return nuisance.integrate_out(self.normal.coupling, tested) / self.variance
 
 
-def _fit_equation(blocks: Blocks, equation: int, roles: ColumnRoles, test: int | None = None) -> _EquationFit:
+@lru_cache(maxsize=64)
+def _fit_equation(blocks: Blocks, equation: int, roles: ColumnRoles, test: int) -> _EquationFit:
     """Fit the nuisance coefficients of an equation and the sensor offset z of p_A - p_B, by Gauss-Newton steps.
 
     The tested coefficient g is free in each block. The leakage is g (p_A - p_B - z) = g (p_A - p_B) - g z. A change of
     g between blocks also changes the constant flow -g z, and so reveals z. z is small, since a first estimate of the
     offset is already removed from the Gram matrices (`pressure_offset.remove_pressure_offset`).
 
-    `test`: column of g, by default the leak's. The result is cached for the last blocks.
+    `test`: column of g. The result is cached for the last blocks.
     """
-    return _fit_equation_once(blocks, equation, roles, roles.leak if test is None else test)
-
-
-@lru_cache(maxsize=64)
-def _fit_equation_once(blocks: Blocks, equation: int, roles: ColumnRoles, test: int) -> _EquationFit:
-    """Fit the nuisance coefficients of an equation and the sensor offset (`_fit_equation`)."""
     gram = blocks.gram[:, equation]
     nuisance = [k for k in roles.nuisance if k != test]
     seconds = max(float(blocks.end[-1] - blocks.start[0]), 1e-9)
@@ -824,7 +819,7 @@ def estimate_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
     Only a leak that changes between blocks reveals it; otherwise it stays near `blocks.zero`, the offset already
     removed.
     """
-    offsets = [_fit_equation(blocks, e, roles).offset for e, roles in enumerate(columns)]
+    offsets = [_fit_equation(blocks, e, roles, roles.leak).offset for e, roles in enumerate(columns)]
     return float(np.mean(blocks.zero)) + float(np.mean(offsets))
 
 
@@ -839,7 +834,7 @@ def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> tuple[Array, A
     """
     leak, bias = roles.leak, roles.bias
     assert bias is not None
-    fit = _fit_equation(blocks, 0, roles)
+    fit = _fit_equation(blocks, 0, roles, roles.leak)
     gram = blocks.gram[:, 0].copy()
     bias_energy = gram[:, bias, bias]
     has_bias = bias_energy > RIDGE * bias_energy.max()  # false if the flow offset's column is zero, as at rest
@@ -875,7 +870,7 @@ def estimate_weighted_mean(
 
     A leak that is free in each block would take the place of a steady motion.
     """
-    fit = _fit_equation(blocks, 0, roles)
+    fit = _fit_equation(blocks, 0, roles, roles.leak)
     normal, n_polynomials = fit.normal, fit.polynomials.shape[1]
     contrast = np.zeros(len(fit.coefficients))  # weights of all coefficients of the fit
     for column, weight in weights.items():
@@ -893,7 +888,7 @@ def estimate_weighted_mean(
 
 def scale_grams(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Array:
     """Divide the Gram matrices (K, E, m, m) of K blocks by the residual variance of a row in each of E equations."""
-    variances = [_fit_equation(blocks, e, roles).variance for e, roles in enumerate(columns)]
+    variances = [_fit_equation(blocks, e, roles, roles.leak).variance for e, roles in enumerate(columns)]
     return np.asarray(blocks.gram / np.array(variances)[:, None, None])
 
 

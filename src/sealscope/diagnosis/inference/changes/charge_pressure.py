@@ -40,7 +40,7 @@ from sealscope.diagnosis.inference.machine_states import find_rests
 from sealscope.diagnosis.inference.observable import Observable, compare_estimates
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.channels import flow_source
-from sealscope.recordings.recording import Array, Recording, compute_once
+from sealscope.recordings.recording import Array, Recording, keep_with_recording
 from sealscope.signals.smoothing import TINY, average_over
 from sealscope.units import P_ATM
 
@@ -68,6 +68,8 @@ def turned_angle(recording: Recording, flow_channel: str) -> Array:
     return np.asarray(np.diff(drive) if flow_channel == "theta" else drive[1:] / recording.rate)
 
 
+@keep_with_recording
+@np.errstate(all="ignore")
 def estimate_low_drifts(recording: Recording) -> Mapping[str, Estimate]:
     """Estimate the drifts [Pa/s] of the lowest pressures of the chambers, by their names "A" and "B".
 
@@ -79,12 +81,6 @@ def estimate_low_drifts(recording: Recording) -> Mapping[str, Estimate]:
     pump counts, or if these do not determine the drift (`_fit_drift`). The result is empty for a recording shorter than
     `MIN_SAMPLES`, and if a pressure, or both angle and speed of the pump, are not recorded. It is cached.
     """
-    return compute_once(recording, ("low drifts",), _estimate_low_drifts)
-
-
-@np.errstate(all="ignore")
-def _estimate_low_drifts(recording: Recording) -> dict[str, Estimate]:
-    """Estimate the drifts of the lowest pressures of the chambers (`estimate_low_drifts`)."""
     flow_channel = flow_source(recording.channels)
     if len(recording) < MIN_SAMPLES or flow_channel not in PUMP or not {"p_A", "p_B"} <= set(recording.channels):
         return {}

@@ -27,7 +27,7 @@ from sealscope.diagnosis.inference.machine_states import is_in_motion, time_in_m
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.motion import find_cycle
-from sealscope.recordings.recording import Array, Recording, compute_once
+from sealscope.recordings.recording import Array, Recording, keep_with_recording
 from sealscope.signals.smoothing import TINY, medians, quantiles
 
 _PRIORS = CHANGES.features
@@ -246,14 +246,13 @@ def feature_step_test(time: Array, values: Array) -> StepTest | None:
 SIGNALS = "signals"
 
 
-def observe_signals(recording: Recording) -> Observed:
-    """Test command, sensors and mean pressures of a recording for sudden lasting changes that no leak causes."""
-    return compute_once(recording, (SIGNALS,), _test_signals)
-
-
+@keep_with_recording
 @np.errstate(all="ignore")
-def _test_signals(recording: Recording) -> Observed:
-    """Test a recording's signals for changes (`observe_signals`); report only a reason if it is too short."""
+def observe_signals(recording: Recording) -> Observed:
+    """Test command, sensors and mean pressures of a recording for sudden lasting changes that no leak causes.
+
+    The report only states a reason if the recording is too short. The result is cached with the recording.
+    """
     shortest = CHANGES.features.shortest  # length of a block [s]
     if len(recording) < BLOCKS * max(ORDER + 2, shortest * recording.rate):  # differences of `ORDER` need samples
         return Observed(SIGNALS, lack="too short to test its signals for changes")

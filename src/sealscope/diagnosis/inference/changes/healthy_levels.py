@@ -430,7 +430,7 @@ class HealthyLevels:
         """Summarise a recording by friction, drifts and spectra; None if nothing can be estimated."""
         nothing = (None, None)
         motion, drifts, zero = select_motion(recording), dict[str, Estimate](), None
-        fit = fit_difference(recording, motion)
+        fit = fit_difference(recording)
         if motion is not None:
             # residuals may be correlated within a stroke
             drifts = {

@@ -30,7 +30,7 @@ from sealscope.diagnosis.inference.comparison import Resistance
 from sealscope.diagnosis.inference.machine_states import AVERAGING_TIME, number_strokes, rest_limit
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.channels import CHAMBERS
-from sealscope.recordings.recording import Array, Recording, compute_once
+from sealscope.recordings.recording import Array, Recording, keep_with_recording
 from sealscope.signals.smoothing import TINY, average_over
 
 #: Maximum number of positions between which the level is linear, and minimum number of rows for each.
@@ -68,6 +68,7 @@ class Motion(NamedTuple):
     top_speed: float
 
 
+@keep_with_recording
 def select_motion(recording: Recording) -> Motion | None:
     """Select the samples in which the piston moves, and build the design matrix of their fit.
 
@@ -330,22 +331,14 @@ def _invert_regular(matrices: Array) -> Array | None:
     return np.asarray(inverses) if (condition < MAX_CONDITION).all() else None
 
 
-def fit_difference(recording: Recording, motion: Motion | None = None) -> Resistance | None:
+@keep_with_recording
+@np.errstate(all="ignore")
+def fit_difference(recording: Recording) -> Resistance | None:
     """Fit p_A - p_B in motion by friction, which reverses with the motion, and a viscous pressure drop (`Resistance`).
 
     The result is None if too few samples are in motion (`select_motion`), or if a value or its error is not finite.
-    `motion`: that of the recording, if it is known.
     """
-    return compute_once(
-        recording,
-        ("motion fit of p_A - p_B",),
-        lambda samples: _fit_difference(samples, motion or select_motion(samples)),
-    )
-
-
-@np.errstate(all="ignore")
-def _fit_difference(recording: Recording, motion: Motion | None) -> Resistance | None:
-    """Fit p_A - p_B in motion by friction and a viscous drop (`fit_difference`)."""
+    motion = select_motion(recording)
     if motion is None:
         return None
     difference = recording["p_A"][motion.rows] - recording["p_B"][motion.rows]

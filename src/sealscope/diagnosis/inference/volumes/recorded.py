@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -158,11 +158,8 @@ class RecordedBalance:
             return self.cycle_oil_loss
         offset = float(self.blocks.zero[0])  # sensor offset that was removed from p_A - p_B [Pa]
 
-        def test_oil_loss(samples: Recording) -> dict[str, StepTest]:
-            """Test the samples, whose motion is known."""
-            return recorded_oil_loss_tests(samples, self.rig, offset)
-
-        return compute_once(self.recording, ("lost oil", self.rig, offset), test_oil_loss, READ)
+        test = partial(recorded_oil_loss_tests, rig=self.rig, offset=offset)
+        return compute_once(self.recording, ("lost oil", self.rig, offset), test, READ)
 
     @property
     def has_position_and_flow(self) -> bool:
