@@ -24,14 +24,11 @@ FUNCTION = re.compile(
 )
 #: Names of public or saved fields and of methods that others call, which keep theirs.
 KEPT = {
-    ("cli/options.py", "of"),
     ("diagnosis/healthy.py", "about"),
     ("diagnosis/live/estimates.py", "judged"),
     ("diagnosis/live/watch.py", "each"),
     ("diagnosis/verdict/diagnosis.py", "about"),
-    ("diagnosis/verdict/machine_sizes.py", "stated"),
     ("monitor/bounded_queue.py", "put"),
-    ("parameters/rig.py", "given"),
     ("simulation/bench/profile.py", "each"),
     ("simulation/experiment.py", "of"),
     ("simulation/faults.py", "at"),

@@ -368,6 +368,6 @@ def test_scripts_may_fail_on_a_level(call, recordings):
 def test_a_file_without_a_date_does_not_get_that_of_its_last_change(tmp_path: Path) -> None:
     file = tmp_path / "log.csv"
     file.write_text("t [s],p_A [bar],p_B [bar]\n" + "".join(f"{k / 50},{k % 7},{k % 5}\n" for k in range(400)))
-    ((start, diagnosis),) = _iter_dated_diagnoses([file], machine=StatedMachine.of(), joined=False)
+    ((start, diagnosis),) = _iter_dated_diagnoses([file], machine=StatedMachine.from_options(), joined=False)
     assert start is None
     assert str(datetime.now(UTC).year) not in table_line(diagnosis, start)

@@ -142,7 +142,7 @@ class StatedMachine:
     baseline: tuple[Path, ...] = ()
 
     @classmethod
-    def of(
+    def from_options(
         cls,
         machine: MachineOption = None,
         maps: MapOption = None,
@@ -259,10 +259,10 @@ class StatedMachine:
 def with_machine_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Build a decorator that replaces the parameter `stated` of a command, a `StatedMachine`, by options of a machine.
 
-    `names`: the options, as names of parameters of `StatedMachine.of`; by default all.
+    `names`: the options, as names of parameters of `StatedMachine.from_options`; by default all.
     """
-    options = inspect.signature(StatedMachine.of, eval_str=True).parameters
-    return _replace_parameter("stated", StatedMachine.of, [options[name] for name in names or options])
+    options = inspect.signature(StatedMachine.from_options, eval_str=True).parameters
+    return _replace_parameter("stated", StatedMachine.from_options, [options[name] for name in names or options])
 
 
 def with_experiment_options(command: Callable[..., None]) -> Callable[..., None]:

@@ -337,7 +337,7 @@ def inspect(
     from sealscope.reporting.overview import overview_text
 
     _reads_standard_input(files)
-    stated = opt.StatedMachine.of(maps=maps, group=group, rate=rate, rig=rig)
+    stated = opt.StatedMachine.from_options(maps=maps, group=group, rate=rate, rig=rig)
     if save_map and (rig is None or not stated.channel_map):
         raise InputError("--save-map needs --rig with a file, and the --map options to be saved")
     machine = stated if stated.has_map else replace(stated, channel_map="auto")

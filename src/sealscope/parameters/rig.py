@@ -79,7 +79,7 @@ class ParameterRow(NamedTuple):
     meaning: str
     value: Value  # in the SI unit `unit`
     unit: str
-    given: str  # value and unit, as the rig's file or an override states them
+    text: str  # value and unit, as the rig's file or an override states them
     source: str
 
 
@@ -354,7 +354,7 @@ class Rig(Part):
                 meaning=str(field.title),
                 value=self[name],
                 unit=unit_of(field),
-                given=entries[name].text(),
+                text=entries[name].text(),
                 source=entries[name].source,
             )
             for name, field in declared_fields().items()

@@ -160,9 +160,9 @@ def parameters_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     fitted = load_rig(BENCH_RIG)
     thesis_rows = {row.name: row for row in load_rig("thesis").table()}
     rows = [
-        (row.name, row.meaning, thesis_rows[row.name].given, row.given, row.source)
+        (row.name, row.meaning, thesis_rows[row.name].text, row.text, row.source)
         for row in fitted.table()
-        if row.given != thesis_rows[row.name].given
+        if row.text != thesis_rows[row.name].text
     ]
     sigma = ", ".join(f"{pressure_noise(fitted, chamber):.2f} psi in {chamber}" for chamber in CHAMBERS)
     return (item.table(rows, f"Noise of a sample, all sources together: {sigma}."),)

@@ -105,7 +105,7 @@ class SizePriors(PriorTable):
 
 
 class TemperingPriors(PriorTable):
-    """How far likelihoods of models are believed, as no model describes a machine exactly."""
+    """Limits of the belief in likelihoods of models, as no model describes a machine exactly."""
 
     term: float  # relative misfit of a term or an event to what it explains
     pattern: float  # relative misfit of a pattern (levels that one cause changes) to a step
