@@ -18,6 +18,7 @@ from sealscope.diagnosis.inference.circuit.holds.recorded_hold import (
     find_charge_pressure,
     find_locked_holds,
 )
+from sealscope.diagnosis.inference.hypotheses import GROWTHS
 from sealscope.diagnosis.inference.machine_states import extend_rests
 from sealscope.diagnosis.inference.volumes.recorded import log_area_ratio
 from sealscope.diagnosis.priors.inference import INFERENCE
@@ -357,11 +358,11 @@ def lost_volumes(chambers: HeldChambers, leak: UnitLeak, onset: float) -> Array:
     return np.concatenate(columns)
 
 
-@pytest.mark.parametrize("growth", [0.0, 1.5])
-def test_products_of_all_onsets_are_those_of_each_onset_by_itself(growth: float) -> None:
+@pytest.mark.parametrize(("k", "growth"), [(0, 0.0), (4, list(GROWTHS)[4])])
+def test_products_of_all_onsets_are_those_of_each_onset_by_itself(k: int, growth: float) -> None:
     chambers = held_press(piston=0.3 * SEAL)
     leak = chambers._unit_piston_leak(PistonLeak(supplies=BOTH))
-    sums = chambers._sum_products(leak, chambers.onsets, growth)
+    sums = chambers._sum_products(leak)[..., k]
     regressors = chambers._regressions[BOTH].regressors
     for onset, found in zip(chambers.onsets.tolist(), sums, strict=True):
         flows = leak.flows * growth_factor(chambers._samples.t, growth, onset, chambers.end)
@@ -376,10 +377,11 @@ def test_offsets_are_scored_together_as_each_by_itself(exponent: float) -> None:
     chambers = held_press(piston=3.0 * SEAL, gain=0.995, loads=(1.0, 0.8, 0.6, 0.4))
     for supplies in chambers._possible_supplies:
         leak = PistonLeak(exponent, supplies=supplies)
-        offsets = np.array([-2e5, 0.0, 3e4])
+        offsets = np.linspace(-2e5, 3e4, 35)  # more than are summed at once
         together = chambers._find_onsets(leak, offsets)
         for offset, (score, found) in zip(offsets.tolist(), together, strict=True):
-            alone = chambers._onset_posteriors(chambers._unit_piston_leak(leak._replace(offset=offset)))
+            sums = chambers._sum_products(chambers._unit_piston_leak(leak._replace(offset=offset)))
+            alone = chambers._onset_posteriors(supplies, sums)[0]
             assert found == leak._replace(offset=offset, onset=float(chambers.onsets[alone.argmax()]))
             share = 0.5 * chambers.n_readings * math.log(chambers._closed_share(supplies))
             expected = alone.max() + chambers._conditions_log_prior(found) + share
@@ -429,7 +431,7 @@ def test_the_least_squares_of_each_onset_are_those_within_the_limits_of_the_oil(
     regression = OilRegression(random.standard_normal(n_rows) * 3.0, strained, aired, inflation, misfit)
     columns = random.standard_normal((n_rows, n_onsets))
     sums = np.column_stack([columns.T @ regression.regressors, (columns**2).sum(axis=0)])
-    scores = score_onsets(regression.onset_priors(variance=0.5, n_readings=n_readings), sums)
+    scores = score_onsets(regression.onset_priors(variance=0.5, n_readings=n_readings), sums[..., None])[0]
     least_dead = prior.least_dead_volume / prior.dead_volume - 1.0
     deviations = np.array(
         [prior.deviation, prior.dead_volume_deviation, prior.dead_volume_deviation, prior.air_deviation]

@@ -27,9 +27,8 @@ Source: Merritt, Hydraulic Control Systems, 1967, section 6.3 (continuity of the
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -64,7 +63,7 @@ from sealscope.diagnosis.inference.circuit.holds.leaks import (
 from sealscope.diagnosis.inference.circuit.holds.onset_sums import (
     HoldSamples,
     OnsetPriors,
-    score_offsets,
+    iter_offset_sums,
     score_onsets,
     sum_onset_products,
 )
@@ -290,12 +289,8 @@ class HeldChambers:
         """
         difference = self.driving_pressure(leak.offset)
         flow = np.sign(difference) * np.abs(difference) ** leak.exponent
-        unit_leak = self._while_closed(np.array([flow, -flow]), leak.supplies)
-        return self._let_grow(unit_leak, leak.growth, leak.onset)
-
-    def _let_grow(self, leak: UnitLeak, growth: float, onset: float) -> UnitLeak:
-        """Multiply the flow of a leak without growth by its `growth_factor`, from the `onset` [s] to the end."""
-        return leak._replace(flows=leak.flows * growth_factor(self._samples.t, growth, onset, self.end))
+        flow *= growth_factor(self._samples.t, leak.growth, leak.onset, self.end)
+        return self._while_closed(np.array([flow, -flow]), leak.supplies)
 
     def _while_closed(self, flows: Array, supplies: SideSupplies) -> UnitLeak:
         """Set `flows` (2, N) out of A and B to 0 while a side is not closed."""
@@ -345,7 +340,14 @@ class HeldChambers:
 
     def fit_piston_leak(self, leak: PistonLeak) -> LeakFit:
         """Fit the coefficient of a leak past the piston; the likelihood includes the priors on offset and supplies."""
-        fit = self._fit_leak(self._unit_piston_leak(leak), leak.onset)
+        onset, regressors = np.array([leak.onset]), self._regressions[leak.supplies].regressors
+        flows = self._unit_piston_leak(leak).flows
+        sums = sum_onset_products(self._samples, flows, np.zeros(1), self.end, onset, regressors)
+        return self._fit_piston_sums(leak, sums[0, :, 0])
+
+    def _fit_piston_sums(self, leak: PistonLeak, sums: Array) -> LeakFit:
+        """Fit the coefficient of a leak past the piston from its `sums` (8,) (`fit_piston_leak`)."""
+        fit = self._fit_leak(leak.supplies, sums)
         return fit._replace(log_likelihood=fit.log_likelihood + self._conditions_log_prior(leak))
 
     def _conditions_log_prior(self, leak: PistonLeak) -> float:
@@ -402,19 +404,24 @@ class HeldChambers:
         """Fit a leak past the piston since `onset` [s] for several sensor offsets, omitting fits without any flow."""
         best = self.piston_fit._replace(onset=onset)
         offsets = (*self._offset_grid.tolist(), best.offset)
-        fits = [self.fit_piston_leak(best._replace(offset=offset)) for offset in offsets]
+        parts = self._iter_offset_sums(best, np.array(offsets), np.array([onset]))
+        sums = np.concatenate([part[0].T for part in parts])
+        leaks = [best._replace(offset=offset) for offset in offsets]
+        fits = [self._fit_piston_sums(*pair) for pair in zip(leaks, sums, strict=True)]
         return [fit for fit in fits if fit.deviation < UNKNOWN]
 
-    def _fit_leak(self, leak: UnitLeak, onset: float) -> LeakFit:
-        """Fit the coefficient (>= 0) of a leak since `onset` [s] to all holds; 0 +- `UNKNOWN` if it has no flow."""
-        sums = self._sum_products(leak, np.array([onset]))[0]
-        value, deviation, by_oil, variance = 0.0, UNKNOWN, 0.0, self._variances_without_leak[leak.supplies]
+    def _fit_leak(self, supplies: SideSupplies, sums: Array) -> LeakFit:
+        """Fit the coefficient (>= 0) of a leak to all holds; 0 +- `UNKNOWN` if it has no flow.
+
+        `sums` (8,): products of the leak's readings (`sum_onset_products`).
+        """
+        value, deviation, by_oil, variance = 0.0, UNKNOWN, 0.0, self._variances_without_leak[supplies]
         if sums[-1] > 0.0:
-            fit = fit_leak(self._regressions[leak.supplies], sums, self.n_readings)
+            fit = fit_leak(self._regressions[supplies], sums, self.n_readings)
             deviation, by_oil = fit.by_noise**0.5, max(fit.by_oil, 0.0) ** 0.5
             if not fit.coefficient < 0.0:  # no leak flows from the lower to the higher pressure
                 value, variance = fit.coefficient, fit.variance
-        closed_variance = variance / self._closed_share(leak.supplies)  # without readings that fit any leak
+        closed_variance = variance / self._closed_share(supplies)  # without readings that fit any leak
         return LeakFit(value, deviation, by_oil, log_likelihood=-0.5 * self.n_readings * math.log(closed_variance))
 
     @cached_property
@@ -449,19 +456,30 @@ class HeldChambers:
         from_start, n_later = INFERENCE.held_oil.share_from_start, len(self.onsets) - 1  # each hold has later ones
         return np.asarray(np.log(np.append(from_start, np.full(n_later, (1.0 - from_start) / n_later))))
 
-    def _sum_products(self, leak: UnitLeak, onsets: Array, growth: float = 0.0) -> Array:
-        """Sum the products of the leak's readings for each of o `onsets` (`sum_onset_products`), (o, 8)."""
-        regressors = self._regressions[leak.supplies].regressors
-        return np.asarray(sum_onset_products(self._samples, leak.flows, growth, self.end, onsets, regressors))
+    def _sum_products(self, leak: UnitLeak) -> Array:
+        """Sum the products of a leak's readings for each of o `onsets` and l of the `GROWTHS`, (o, 8, l)."""
+        regressors, growths = self._regressions[leak.supplies].regressors, np.array(list(GROWTHS))
+        return sum_onset_products(self._samples, leak.flows, growths, self.end, self.onsets, regressors)
 
-    def _onset_posteriors(self, leak: UnitLeak, growth: float = 0.0) -> Array:
-        """Compute the log posterior probability of each possible onset of a leak (`onsets`), shape (o,).
+    def _iter_offset_sums(self, leak: PistonLeak, offsets: Array, onsets: Array) -> Iterator[Array]:
+        """Yield the products of a leak past the piston for sensor `offsets` (g,) [Pa] and `onsets` (o,) [s], in parts.
+
+        Each part is an array (o, 8, l) for l of the offsets (`iter_offset_sums`).
+        """
+        hold_offsets, _, is_equalised = self._hold_offsets(offsets)
+        return iter_offset_sums(
+            self._samples, hold_offsets, is_equalised, leak.exponent, INFERENCE.held_oil.resolution,
+            self._closed_samples[leak.supplies], onsets, self._regressions[leak.supplies].regressors,
+        )  # fmt: skip
+
+    def _onset_posteriors(self, supplies: SideSupplies, sums: Array) -> Array:
+        """Compute the log posterior probability of each possible onset (`onsets`) of l leaks, shape (l, o).
 
         It is log prior - N/2 log(residual sum of squares), up to a constant, for N independent readings and a
-        coefficient >= 0, with the properties of the oil eliminated (`score_onsets`). `growth`: as in `PistonLeak`.
+        coefficient >= 0, with the properties of the oil eliminated (`score_onsets`). `sums` (o, 8, l): products of the
+        leaks' readings.
         """
-        sums = self._sum_products(leak, self.onsets, growth)
-        return np.asarray(self._onset_log_priors + score_onsets(self._onset_priors[leak.supplies], sums))
+        return np.asarray(self._onset_log_priors + score_onsets(self._onset_priors[supplies], sums))
 
     @cached_property
     def _offset_grid(self) -> Array:
@@ -496,18 +514,15 @@ class HeldChambers:
             leak = PistonLeak(exponent, supplies=supplies)
             coarse_fits = self._find_onsets(leak, grid)
             best = int(np.argmax([posterior for posterior, _ in coarse_fits]))
-            refined = np.linspace(grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)], N_REFINED)
+            # the first and the last point are of the coarse grid
+            refined = np.linspace(grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)], N_REFINED)[1:-1]
             fits += [*self._find_onsets(leak, refined), coarse_fits[best]]
         return max(fits, key=lambda fit: fit[0])[1]  # with the highest posterior
 
     def _find_onsets(self, leak: PistonLeak, offsets: Array) -> list[tuple[float, PistonLeak]]:
         """Find the most probable onset of a `leak` for each sensor offset; return each log posterior and leak."""
-        regression, priors = self._regressions[leak.supplies], self._onset_priors[leak.supplies]
-        hold_offsets, _, is_equalised = self._hold_offsets(offsets)
-        scores = self._onset_log_priors + score_offsets(
-            priors, self._samples, hold_offsets, is_equalised, leak.exponent, INFERENCE.held_oil.resolution,
-            self._closed_samples[leak.supplies], self.onsets, regression.regressors,
-        )  # fmt: skip
+        parts = self._iter_offset_sums(leak, offsets, self.onsets)
+        scores = np.concatenate([self._onset_posteriors(leak.supplies, sums) for sums in parts])
         # the variance of readings, which is too small by this share, must be no evidence for sides that are not closed
         correction = 0.5 * self.n_readings * math.log(self._closed_share(leak.supplies))
         conditions = self._supply_log_priors[leak.supplies] - 0.5 * self._offset_costs(offsets)
@@ -528,14 +543,14 @@ class HeldChambers:
         """
         laws = []
         for leak, law_prior in zip(self.piston_fits, LAWS.values(), strict=True):
-            unit_leak, conditions_log_prior = self._unit_piston_leak(leak), self._conditions_log_prior(leak)
-            for growth, growth_prior in GROWTHS.items():
+            sums = self._sum_products(self._unit_piston_leak(leak._replace(growth=0.0)))
+            onset_posteriors = self._onset_posteriors(leak.supplies, sums)
+            for k, (growth, growth_prior) in enumerate(GROWTHS.items()):
                 log_prior = math.log(law_prior * growth_prior)
-                posteriors = log_prior + self._onset_posteriors(unit_leak, growth)
-                onset = float(self.onsets[posteriors.argmax()])
-                fit = self._fit_leak(self._let_grow(unit_leak, growth, onset), onset)
-                fit = fit._replace(log_likelihood=fit.log_likelihood + conditions_log_prior)
-                law = leak._replace(growth=growth, onset=onset)
+                posteriors = log_prior + onset_posteriors[k]
+                best = int(posteriors.argmax())
+                law = leak._replace(growth=growth, onset=float(self.onsets[best]))
+                fit = self._fit_piston_sums(law, sums[best, :, k])
                 laws.append((LawFit(law, fit, fit.log_likelihood + log_prior), posteriors))
         return laws
 
@@ -553,15 +568,16 @@ class HeldChambers:
         probability.
         """
         fits, log_weights = list[tuple[LeakFit, int]](), list[float]()
-        for leak, (growth, probability) in itertools.product(leaks, GROWTHS.items()):
-            index = int(self._onset_posteriors(leak, growth).argmax())
-            onset = float(self.onsets[index])
-            fit = self._fit_leak(self._let_grow(leak, growth, onset), onset)
-            mean_ratio = 1.0 + 0.5 * growth  # mean over initial coefficient, for a linear growth
-            fits.append((fit.scale(mean_ratio, fit.log_likelihood), index))  # scaling does not change the likelihood
-            # such a leak moves no oil to the other side, which therefore does not drain
-            log_prior = math.log(probability) + self._supply_log_prior(leak.supplies, drains=False)
-            log_weights.append(fit.log_likelihood + log_prior)
+        for leak in leaks:
+            sums = self._sum_products(leak)
+            indices = self._onset_posteriors(leak.supplies, sums).argmax(axis=1).tolist()
+            for k, (growth, probability) in enumerate(GROWTHS.items()):
+                fit = self._fit_leak(leak.supplies, sums[indices[k], :, k])
+                mean_ratio = 1.0 + 0.5 * growth  # mean over initial coefficient, for a linear growth
+                fits.append((fit.scale(mean_ratio, fit.log_likelihood), indices[k]))  # with the same likelihood
+                # such a leak moves no oil to the other side, which therefore does not drain
+                log_prior = math.log(probability) + self._supply_log_prior(leak.supplies, drains=False)
+                log_weights.append(fit.log_likelihood + log_prior)
         fit, index = fits[int(np.argmax(log_weights))]
         return fit._replace(log_likelihood=float(np.logaddexp.reduce(log_weights))), index
 

@@ -10,13 +10,16 @@ With the relative growth g from s to the end e of the recording, the flow u of a
     (1 + g (t - s)/(e - s)) u = (1 + g) u - g/(e - s) (e - t) u,
 
 so that the products follow from those of the flows u and (e - t) u.
+
+The products of several leaks are summed side by side: arrays have the leaks along their last axis, over which the
+innermost loops run on the vector registers of the processor.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,6 +38,9 @@ _FREE: NDArray[np.bool_] = np.array(list(itertools.product((True, False), repeat
 _MIN_PIVOT, _MIN_ENERGY = 1e-15, 1e-12
 #: Relative rounding error that a property may lie outside of its limits.
 ROUNDING = 1e-9
+#: Most leaks whose products are summed side by side, so that the arrays of a hold stay in the processor's cache, and
+#: number of leaks in a whole round of the innermost loops.
+_MOST_LEAKS, _WIDTH = 32, 16
 _TINY = float(np.finfo(float).tiny)
 
 
@@ -121,28 +127,47 @@ class OnsetPriors(NamedTuple):
     n_readings: float
 
 
-class Workspace(NamedTuple):
-    """Scratch arrays for N samples and o onsets, since compiled laws allocate no memory.
+class SumWorkspace(NamedTuple):
+    """Scratch arrays for the sums over n samples, the most of a hold, and o onsets of l leaks side by side.
 
-    - `flows` (4, N): flow out of A and out of B of a leak with a coefficient of 1, and both times the time to the end.
-    - `integrals` (8, N + 1): volumes of these flows since the beginning of a hold, and the sums of these volumes.
-    - `columns` (2, N): readings of one side; `later`, `here` (2, 9): products (`_add_products`).
-    - `sums` (o, 8), `squares` (o,): results for each onset; `per_leak` (o, 4), `with_column` (o, 5), `energies` (o,).
+    - `flow` (2, n, l): flow out of A and out of B of each leak with a coefficient of 1, in one hold.
+    - `volume` (2, n, l), `sums` (2, n + 1, l): volumes of these flows since the beginning of the hold, and their sums.
+    - `column` (n, l), `before`, `mean` (l,): readings of one side, and parts of these.
+    - `later` (9, l), `products` (o, 9, l): products (`_add_products`) of later holds, and for each onset.
+    """
+
+    flow: Any
+    volume: Any
+    sums: Any
+    column: Any
+    before: Any
+    mean: Any
+    later: Any
+    products: Any
+
+    @classmethod
+    def with_sizes(cls, n_samples: int, n_onsets: int, n_leaks: int) -> SumWorkspace:
+        """Allocate the arrays."""
+        n, rows = n_samples, N_REGRESSORS + 2
+        shapes = [(2, n), (2, n), (2, n + 1), (n,), (), (), (rows,), (n_onsets, rows)]
+        return cls._make([np.zeros((*shape, n_leaks)) for shape in shapes])
+
+
+class Workspace(NamedTuple):
+    """Scratch arrays for the scores of o onsets, since compiled laws allocate no memory.
+
+    - `squares` (o,): results for each onset; `per_leak` (o, 4), `with_column` (o, 5), `column_squares`, `energies`
+      (o,).
     - `basis` (7, 5), `gram` (5, 5), `masked`, `factor`, `inverse` (4, 4), `scale`, `limits`, `remainder`,
       `without_leak`, `slope_without` (4,): parts of a fit; `unsolved` (o,): onsets whose least squares are not found;
       `cases`, `n_solved` (16,): cases of properties at their limits, in the order in which they are tried, and the
       number of onsets whose least squares each has found.
     """
 
-    flows: Any
-    integrals: Any
-    columns: Any
-    later: Any
-    here: Any
-    sums: Any
     squares: Any
     per_leak: Any
     with_column: Any
+    column_squares: Any
     energies: Any
     basis: Any
     gram: Any
@@ -159,142 +184,127 @@ class Workspace(NamedTuple):
     n_solved: Any
 
     @classmethod
-    def with_sizes(cls, n_samples: int, n_onsets: int) -> Workspace:
-        """Allocate the arrays."""
+    def with_onsets(cls, n_onsets: int) -> Workspace:
+        """Allocate the arrays for a number of onsets."""
         n, k = N_OIL, N_OIL + 1
-        shapes: list[tuple[int, ...]] = [(4, n_samples), (8, n_samples + 1), (2, n_samples)]
-        shapes += [(2, N_REGRESSORS + 2)] * 2 + [(n_onsets, N_REGRESSORS + 1), (n_onsets,), (n_onsets, n)]
-        shapes += [(n_onsets, k), (n_onsets,), (N_REGRESSORS, k), (k, k), *[(n, n)] * 3, *[(n,)] * 5]
+        shapes: list[tuple[int, ...]] = [(n_onsets,), (n_onsets, n), (n_onsets, k), (n_onsets,), (n_onsets,)]
+        shapes += [(N_REGRESSORS, k), (k, k), *[(n, n)] * 3, *[(n,)] * 5]
         cases, n_solved = np.arange(len(_FREE)), np.zeros(len(_FREE), dtype=np.intp)
         return cls._make([*map(np.empty, shapes), np.empty(n_onsets, dtype=np.intp), cases, n_solved])
 
 
 @large_law
-def _integrate(samples: Any, hold: int, flow: Any, volume: Any, sums: Any) -> None:
-    """Write the volume that a `flow` (N,) has lost since the beginning of a hold to `volume` (N,), and its sums.
+def _integrate(samples: Any, hold: int, work: Any) -> None:
+    """Integrate `work.flow` of a hold to the `volume` that has left since its beginning, and to the `sums` of these.
 
-    `sums` (N + 1,): sum of the volumes of the hold's samples before each.
+    The sums are those of the volumes of the hold's samples before each.
     """
-    begin, end = samples.begin[hold], samples.begin[hold + 1]
-    volume[begin] = sums[begin] = sums[begin + 1] = 0.0
-    for i in range(begin + 1, end):
-        volume[i] = volume[i - 1] + 0.5 * (flow[i] + flow[i - 1]) * (samples.t[i] - samples.t[i - 1])
-        sums[i + 1] = sums[i] + volume[i]
+    begin, n_leaks = samples.begin[hold], len(work.before)
+    for side in range(2):
+        flow, volume, sums = work.flow[side], work.volume[side], work.sums[side]
+        for j in range(n_leaks):
+            volume[0, j] = sums[0, j] = sums[1, j] = 0.0
+        for i in range(1, samples.begin[hold + 1] - begin):
+            half_step = 0.5 * (samples.t[begin + i] - samples.t[begin + i - 1])
+            for j in range(n_leaks):
+                volume[i, j] = volume[i - 1, j] + (flow[i, j] + flow[i - 1, j]) * half_step
+                sums[i + 1, j] = sums[i, j] + volume[i, j]
 
 
 @large_law
-def _fill_column(samples: Any, hold: int, volume: Any, sums: Any, onset: float, is_A: bool, column: Any) -> None:
-    """Write the readings of one side of a hold for a leak since `onset` [s], less their mean, to `column` (k,).
+def _fill_column(samples: Any, hold: int, side: int, onset: float, work: Any) -> None:
+    """Write the readings of one side of a hold for leaks since `onset` [s], less their mean, to `work.column` (k, l).
 
-    `volume`, `sums`: as by `_integrate`. A sample at t shows the volume V(t) - V(onset) that has left since the onset,
-    0 before it. See `HoldSamples.centre` for the mean.
+    A sample at t shows the volume V(t) - V(onset) that has left since the onset, 0 before it (`_integrate`). `side`: 0
+    for A, 1 for B. See `HoldSamples.centre` for the mean.
     """
-    begin, end = samples.begin[hold], samples.begin[hold + 1]
+    volume, sums, column, before, mean = work.volume[side], work.sums[side], work.column, work.before, work.mean
+    begin, n_leaks = samples.begin[hold], len(before)
     edge, last_edge = samples.first_edge[hold], samples.first_edge[hold + 1] - 1
-    first, after = begin, end  # by bisection, the first sample that is not before the onset
+    first, after = 0, samples.begin[hold + 1] - begin  # by bisection, the first sample that is not before the onset
     while first < after:
         middle = (first + after) // 2
-        if samples.t[middle] < onset:
+        if samples.t[begin + middle] < onset:
             first = middle + 1
         else:
             after = middle
-    before = 0.0  # V(onset)
-    if first > begin:
-        step = samples.t[first] - samples.t[first - 1]
-        part = (onset - samples.t[first - 1]) / step
-        before = volume[first - 1] + (volume[first] - volume[first - 1]) * part
-    mean, n_counted = 0.0, 0
-    skipped = 1 if samples.is_A_loaded[hold] == is_A else 0  # the valves may still be shutting
-    for k in range(last_edge - edge):
-        low, high = samples.edges[edge + k], samples.edges[edge + k + 1]
+    for j in range(n_leaks):
+        before[j] = mean[j] = 0.0
+    if first > 0:  # V(onset)
+        step = samples.t[begin + first] - samples.t[begin + first - 1]
+        part = (onset - samples.t[begin + first - 1]) / step
+        for j in range(n_leaks):
+            before[j] = volume[first - 1, j] + (volume[first, j] - volume[first - 1, j]) * part
+    skipped = 1 if samples.is_A_loaded[hold] == (side == 0) else 0  # the valves may still be shutting
+    n_readings = last_edge - edge
+    for k in range(n_readings):
+        low, high = samples.edges[edge + k] - begin, samples.edges[edge + k + 1] - begin
         start = min(max(low, first), high)
-        column[k] = (sums[high] - sums[start] - (high - start) * before) / (high - low)
+        share, part = 1.0 / (high - low), (high - start) / (high - low)
+        for j in range(n_leaks):
+            column[k, j] = (sums[high, j] - sums[start, j]) * share - part * before[j]
         if k >= skipped:
-            mean += column[k]
-            n_counted += 1
-    mean /= n_counted
-    for k in range(last_edge - edge):
-        column[k] = column[k] - mean if k >= skipped else 0.0
+            for j in range(n_leaks):
+                mean[j] += column[k, j]
+    for j in range(n_leaks):
+        mean[j] /= n_readings - skipped
+    for k in range(n_readings):
+        for j in range(n_leaks):
+            column[k, j] = column[k, j] - mean[j] if k >= skipped else 0.0
 
 
 @large_law
 def _add_products(
-    samples: Any,
-    hold: int,
-    integrals: Any,
-    onset: float,
-    is_growing: bool,
-    regressors: Any,
-    columns: Any,
-    products: Any,
+    samples: Any, hold: int, onset: float, are_paired: bool, regressors: Any, work: Any, products: Any
 ) -> None:
-    """Add the products of a leak's readings in one hold, of both sides, to `products` (2, 9).
+    """Add the products of l leaks' readings in one hold, of both sides, to `products` (9, l).
 
-    `integrals` (8, N + 1): volumes and sums of the flow out of A, out of B, and both times the time to the end of the
-    recording (`_integrate`). `products` are those of each of these two leaks with the regressors (7), with the first
-    leak and with the second. `columns` (2, N): work array.
+    They are those with the regressors (7), of the readings with themselves and, if the leaks `are_paired`, of the first
+    leak's readings with the second's.
     """
-    n_readings = samples.first_edge[hold + 1] - samples.first_edge[hold] - 1
-    n_flows = 2 if is_growing else 1
+    n_readings, n_leaks, column = (
+        samples.first_edge[hold + 1] - samples.first_edge[hold] - 1,
+        len(work.before),
+        work.column,
+    )
     for side in range(2):
+        _fill_column(samples, hold, side, onset, work)
         row = 2 * (samples.first_edge[hold] - hold) + side * n_readings
-        for j in range(n_flows):
-            flow = 2 * (2 * j + side)
-            _fill_column(samples, hold, integrals[flow], integrals[flow + 1], onset, side == 0, columns[j])
-        for j in range(n_flows):
+        for k in range(n_readings):
             for i in range(N_REGRESSORS):
-                product = 0.0
-                for k in range(n_readings):
-                    product += columns[j, k] * regressors[row + k, i]
-                products[j, i] += product
-            for i in range(n_flows):
-                product = 0.0
-                for k in range(n_readings):
-                    product += columns[j, k] * columns[i, k]
-                products[j, N_REGRESSORS + i] += product
+                regressor = regressors[row + k, i]
+                for j in range(n_leaks):
+                    products[i, j] += column[k, j] * regressor
+            for j in range(n_leaks):
+                products[N_REGRESSORS, j] += column[k, j] * column[k, j]
+            if are_paired:
+                products[N_REGRESSORS + 1, 0] += column[k, 0] * column[k, 1]
 
 
 @large_law
-def _combine_products(products: Any, growth: float, time_left: float, combined: Any) -> None:
-    """Write the products of a growing leak's column with the regressors and with itself to `combined` (8,)."""
-    without, rate = 1.0 + growth, -growth / max(time_left, _TINY)
-    for i in range(N_REGRESSORS):
-        combined[i] = without * products[0, i] + (rate * products[1, i] if growth else 0.0)
-    n, squares = N_REGRESSORS, without**2 * products[0, N_REGRESSORS]
-    if growth:
-        squares += rate * (2.0 * without * products[0, n + 1] + rate * products[1, n + 1])
-    combined[n] = max(squares, 0.0)
+def _copy_later(work: Any, onset: int) -> None:
+    """Copy the products of later holds, `work.later`, to those of the onset with an index."""
+    for i in range(N_REGRESSORS + 2):
+        for j in range(len(work.before)):
+            work.products[onset, i, j] = work.later[i, j]
 
 
 @large_law
-def _sum_over_onsets(samples: Any, growth: float, end: float, onsets: Any, regressors: Any, work: Any) -> None:
-    """Write the products of a leak's column, for each of the sorted `onsets` (o,), to `work.sums` (o, 8).
+def _sum_hold(samples: Any, hold: int, k: int, are_paired: bool, onsets: Any, regressors: Any, work: Any) -> int:
+    """Write the products for the onsets up to `k` that lie after the beginning of a hold to `work.products`.
 
-    They are those with the regressors (7) and the column's sum of squares. `work.flows` holds the flows, those times
-    the time to the `end` of the recording only if the leak grows. `_add_products` computes the products of one hold;
-    those of later holds are accumulated.
+    `work.flow` holds the flows in the hold, `work.later` the products of later holds, to which those of this hold are
+    added. The holds are visited from the last one backwards. Returns the last of the sorted `onsets` that remains.
     """
-    is_growing = growth != 0.0
-    for j in range(2):
-        for i in range(N_REGRESSORS + 2):
-            work.later[j, i] = 0.0
-    k = len(onsets) - 1
-    for hold in range(len(samples.begin) - 2, -1, -1):
-        for flow in range(4 if is_growing else 2):
-            _integrate(samples, hold, work.flows[flow], work.integrals[2 * flow], work.integrals[2 * flow + 1])
-        begin, last = samples.t[samples.begin[hold]], samples.t[samples.begin[hold + 1] - 1]
-        while k >= 0 and onsets[k] > begin:
-            for j in range(2):
-                for i in range(N_REGRESSORS + 2):
-                    work.here[j, i] = work.later[j, i]
-            if onsets[k] <= last:
-                _add_products(samples, hold, work.integrals, onsets[k], is_growing, regressors, work.columns, work.here)
-            _combine_products(work.here, growth, end - onsets[k], work.sums[k])
-            k -= 1
-        _add_products(samples, hold, work.integrals, begin, is_growing, regressors, work.columns, work.later)
-    while k >= 0:
-        _combine_products(work.later, growth, end - onsets[k], work.sums[k])
+    _integrate(samples, hold, work)
+    begin, last = samples.t[samples.begin[hold]], samples.t[samples.begin[hold + 1] - 1]
+    while k >= 0 and onsets[k] > begin:
+        _copy_later(work, k)
+        if onsets[k] <= last:
+            _add_products(samples, hold, onsets[k], are_paired, regressors, work, work.products[k])
         k -= 1
+    _add_products(samples, hold, begin, are_paired, regressors, work, work.later)
+    return k
 
 
 @large_law
@@ -363,14 +373,15 @@ def _solve(factor: Any, values: Any) -> None:
 
 
 @large_law
-def _residual_squares(priors: Any, sums: Any, variance: float, work: Any) -> None:
+def _residual_squares(priors: Any, variance: float, work: Any) -> None:
     """Write the residual sum of squares of the fit of a leak since each of o onsets to `work.squares` (o,).
 
-    `sums` (o, 8): products by `_sum_over_onsets`, of which `work.with_column` holds those with the combinations
-    `work.basis` (`_fill_basis`); `variance`: variance of a reading, which weights the priors. The least squares within
-    the limits of the properties are the smallest of 16 cases: some properties are at their limits, and the others are
-    free and within them. If the squares do not fall either where a property leaves its limit, no other case has less,
-    as the squares are convex. The case that ends the search at the most onsets is the first of the next fit.
+    `work.with_column` holds the products of the leak's readings with the combinations `work.basis` (`_fill_basis`),
+    `work.column_squares` those with themselves; `variance`: variance of a reading, which weights the priors. The least
+    squares within the limits of the properties are the smallest of 16 cases: some properties are at their limits, and
+    the others are free and within them. If the squares do not fall either where a property leaves its limit, no other
+    case has less, as the squares are convex. The case that ends the search at the most onsets is the first of the next
+    fit.
     """
     basis, gram, masked, factor, squares = work.basis, work.gram, work.masked, work.factor, work.squares
     scale, limits, remainder = work.scale, work.limits, work.remainder
@@ -380,7 +391,7 @@ def _residual_squares(priors: Any, sums: Any, variance: float, work: Any) -> Non
     for a in range(N_OIL):
         gram[a, a] += variance * priors.precisions[a]
         scale[a] = math.sqrt(gram[a, a])
-    n_left = len(sums)  # number of onsets with other cases to try, the first of `unsolved`
+    n_left = len(squares)  # number of onsets with other cases to try, the first of `unsolved`
     for o in range(n_left):
         squares[o], unsolved[o] = np.inf, o
     largest = 0.0  # the largest energy so far
@@ -416,7 +427,7 @@ def _residual_squares(priors: Any, sums: Any, variance: float, work: Any) -> Non
                 slope_without[a] += gram[a, b] * without_leak[b]
         for k_left in range(n_left):
             o = unsolved[k_left]
-            energy = sums[o, N_REGRESSORS]
+            energy = work.column_squares[o]
             for a in range(N_OIL):
                 change = 0.0  # decrease of this change for a leak with a coefficient of 1
                 for b in range(N_OIL):
@@ -458,59 +469,82 @@ def _residual_squares(priors: Any, sums: Any, variance: float, work: Any) -> Non
         work.cases[rank], work.n_solved[rank] = case, n_solved
 
 
-@large_law
+@kernel
 def _score(priors: Any, sums: Any, work: Any, log_likelihoods: Any) -> None:
-    """Write the log likelihood of a leak at each onset, -N/2 log(residual sum of squares), to `log_likelihoods` (o,).
+    """Write the log likelihoods (l, o) of `score_onsets`.
 
     The variance of the readings weights the priors: first that without a leak, then that of the most probable onset.
     """
-    for a in range(N_OIL):
-        work.limits[a] = 0.0  # no changes, and no fixed properties
-    _fill_basis(work.limits, work.limits, 0, work.basis)
-    for o in range(len(sums)):
-        for a in range(N_OIL + 1):
-            value = 0.0
-            for i in range(N_REGRESSORS):
-                value += sums[o, i] * work.basis[i, a]
-            work.with_column[o, a] = value
-    variance = priors.variance
-    for _ in range(2):
-        _residual_squares(priors, sums, variance, work)
-        least = np.inf
+    for leak in range(len(log_likelihoods)):
+        for a in range(N_OIL):
+            work.limits[a] = 0.0  # no changes, and no fixed properties
+        _fill_basis(work.limits, work.limits, 0, work.basis)
         for o in range(len(sums)):
-            work.squares[o] += priors.misfit_variance * priors.n_rows
-            least = min(least, work.squares[o])
-        variance = least / priors.n_rows
-    for o in range(len(sums)):
-        log_likelihoods[o] = -0.5 * priors.n_readings * math.log(work.squares[o])
+            work.column_squares[o] = sums[o, N_REGRESSORS, leak]
+            for a in range(N_OIL + 1):
+                value = 0.0
+                for i in range(N_REGRESSORS):
+                    value += sums[o, i, leak] * work.basis[i, a]
+                work.with_column[o, a] = value
+        variance = priors.variance
+        for _ in range(2):
+            _residual_squares(priors, variance, work)
+            least = np.inf
+            for o in range(len(sums)):
+                work.squares[o] += priors.misfit_variance * priors.n_rows
+                least = min(least, work.squares[o])
+            variance = least / priors.n_rows
+        for o in range(len(sums)):
+            log_likelihoods[leak, o] = -0.5 * priors.n_readings * math.log(work.squares[o])
+
+
+def score_onsets(priors: OnsetPriors, sums: Array) -> Array:
+    """Compute the log likelihood of l leaks since each of o onsets, (l, o), up to a constant, from `sums` (o, 8, l).
+
+    It is -N/2 log(residual sum of squares).
+    """
+    log_likelihoods = np.empty((sums.shape[2], len(sums)))
+    _score(priors, np.ascontiguousarray(sums), Workspace.with_onsets(len(sums)), log_likelihoods)
+    return log_likelihoods
 
 
 @kernel
-def _sum_products(samples: Any, flows: Any, growth: float, end: float, onsets: Any, regressors: Any, work: Any) -> None:
-    """Write the products of a leak with `flows` (2, N) for each onset to `work.sums` (`sum_onset_products`)."""
-    for side in range(2):
-        for i in range(len(samples.t)):
-            work.flows[side, i] = flows[side, i]
-            work.flows[2 + side, i] = flows[side, i] * (end - samples.t[i])
-    _sum_over_onsets(samples, growth, end, onsets, regressors, work)
+def _sum_products(samples: Any, flows: Any, end: float, onsets: Any, regressors: Any, work: Any) -> None:
+    """Write the products of the leaks with the flows u, in `flows` (2, N), and (`end` - t) u to `work.products`."""
+    k = len(onsets) - 1
+    for hold in range(len(samples.begin) - 2, -1, -1):
+        for i in range(samples.begin[hold], samples.begin[hold + 1]):
+            for side in range(2):
+                work.flow[side, i - samples.begin[hold], 0] = flows[side, i]
+                work.flow[side, i - samples.begin[hold], 1] = flows[side, i] * (end - samples.t[i])
+        k = _sum_hold(samples, hold, k, True, onsets, regressors, work)
+    for o in range(k + 1):
+        _copy_later(work, o)
 
 
 def sum_onset_products(
-    samples: HoldSamples, flows: Array, growth: float, end: float, onsets: Array, regressors: Array
+    samples: HoldSamples, flows: Array, growths: Array, end: float, onsets: Array, regressors: Array
 ) -> Array:
-    """Compute the products of a leak's readings with the regressors (7) and with themselves, for each onset, (o, 8).
+    """Compute products of a leak's readings, for each of o onsets and l growths, (o, 8, l).
 
-    `flows` (2, N): flows out of A and B for a coefficient of 1; `growth`: relative growth of the leak from its onset to
-    the `end` of the recording [s]; `onsets` (o,): sorted [s]; `regressors` (r, 7): of the rows of `build_regression`.
+    They are those with the regressors (7) and with themselves. `flows` (2, N): flows out of A and B for a coefficient
+    of 1; `growths` (l,): relative growths of the leak from its onset to the `end` of the recording [s]; `onsets` (o,):
+    sorted [s]; `regressors` (r, 7): of the rows of `build_regression`.
     """
-    work = Workspace.with_sizes(len(samples.t), len(onsets))
-    _sum_products(samples, flows, growth, end, onsets, regressors, work)
-    return np.asarray(work.sums)
+    work = SumWorkspace.with_sizes(int(samples.sizes.max()), len(onsets), 2)
+    _sum_products(samples, flows, end, onsets, regressors, work)
+    without, rate = 1.0 + growths, -growths / np.maximum(end - onsets, _TINY)[:, None]
+    products, n = work.products[..., :1], N_REGRESSORS
+    late_products, both = work.products[..., 1], work.products[:, n + 1, :1]
+    sums = without * products[:, : n + 1]
+    sums[:, :n] += rate[:, None] * late_products[:, :n, None]
+    sums[:, n] = without**2 * products[:, n] + rate * (2.0 * without * both + rate * late_products[:, n, None])
+    np.maximum(sums[:, n], 0.0, out=sums[:, n])
+    return np.asarray(sums)
 
 
 @kernel
-def _score_offsets(
-    priors: Any,
+def _sum_offsets(
     samples: Any,
     offsets: Any,
     is_equalised: Any,
@@ -520,29 +554,35 @@ def _score_offsets(
     onsets: Any,
     regressors: Any,
     work: Any,
-    log_likelihoods: Any,
 ) -> None:
-    """Write the log likelihoods (g, o) of `score_offsets`."""
-    for g in range(len(offsets)):
-        for hold in range(len(samples.begin) - 1):
-            for i in range(samples.begin[hold], samples.begin[hold + 1]):
-                difference = samples.difference[i] - offsets[g, hold]
-                if is_equalised[g, hold]:
+    """Write the products of `iter_offset_sums` for l offsets to `work.products`."""
+    k = len(onsets) - 1
+    n_leaks = len(work.before)
+    for hold in range(len(samples.begin) - 2, -1, -1):
+        for i in range(samples.begin[hold], samples.begin[hold + 1]):
+            flow, opposite = work.flow[0, i - samples.begin[hold]], work.flow[1, i - samples.begin[hold]]
+            for j in range(n_leaks):
+                difference = samples.difference[i] - offsets[hold, j]
+                if is_equalised[hold, j]:
                     difference *= small_difference_factor(difference, resolved)
                 # a power costs more than all other steps of a sample
                 magnitude = abs(difference)
-                flow = magnitude
-                if exponent != 1.0:
-                    flow = math.sqrt(magnitude) if exponent == 0.5 else magnitude**exponent
-                flow = math.copysign(flow, difference)
-                work.flows[0, i] = flow if is_closed[0, i] else 0.0
-                work.flows[1, i] = -flow if is_closed[1, i] else 0.0
-        _sum_over_onsets(samples, 0.0, 0.0, onsets, regressors, work)
-        _score(priors, work.sums, work, log_likelihoods[g])
+                if exponent == 0.5:
+                    magnitude = math.sqrt(magnitude)
+                elif exponent == 0.75:
+                    magnitude = math.sqrt(magnitude) * math.sqrt(math.sqrt(magnitude))
+                elif exponent != 1.0:
+                    magnitude = magnitude**exponent
+                flow[j] = math.copysign(magnitude, difference)
+            for j in range(n_leaks):
+                opposite[j] = -flow[j] if is_closed[1, i] else 0.0
+                flow[j] = flow[j] if is_closed[0, i] else 0.0
+        k = _sum_hold(samples, hold, k, False, onsets, regressors, work)
+    for o in range(k + 1):
+        _copy_later(work, o)
 
 
-def score_offsets(
-    priors: OnsetPriors,
+def iter_offset_sums(
     samples: HoldSamples,
     offsets: Array,
     is_equalised: NDArray[np.bool_],
@@ -551,33 +591,24 @@ def score_offsets(
     is_closed: NDArray[np.bool_],
     onsets: Array,
     regressors: Array,
-) -> Array:
-    """Compute the log likelihood of a leak past the piston for each of g sensor offsets and o onsets, (g, o).
+) -> Iterator[Array]:
+    """Yield products of a leak past the piston for g sensor offsets and o onsets, (o, 8, l), l of the offsets a time.
 
     `offsets`, `is_equalised` (g, H): the sensor offset of each hold [Pa], and true if a leak has equalised its
     pressures (`estimate_hold_offsets`); `exponent`: of the leak's law; `resolved`: as for
     `small_difference_factor`; `is_closed` (2, N): true while A, B are closed; `onsets`, `regressors`: as for
     `sum_onset_products`. The law of the flow is that of `HeldChambers._unit_piston_leak`.
     """
-    log_likelihoods = np.empty((len(offsets), len(onsets)))
-    _score_offsets(
-        priors, samples, offsets, is_equalised, exponent, resolved, is_closed, onsets, regressors,
-        Workspace.with_sizes(len(samples.t), len(onsets)), log_likelihoods,
-    )  # fmt: skip
-    return log_likelihoods
-
-
-@kernel
-def _score_sums(priors: Any, sums: Any, work: Any, log_likelihoods: Any) -> None:
-    """Write the log likelihoods (o,) of `score_onsets`."""
-    _score(priors, sums, work, log_likelihoods)
-
-
-def score_onsets(priors: OnsetPriors, sums: Array) -> Array:
-    """Compute the log likelihood of a leak since each of o onsets, (o,), up to a constant, from its `sums` (o, 8)."""
-    log_likelihoods = np.empty(len(sums))
-    _score_sums(priors, sums, Workspace.with_sizes(0, len(sums)), log_likelihoods)
-    return log_likelihoods
+    work: SumWorkspace | None = None
+    for first in range(0, len(offsets), _MOST_LEAKS):
+        rows = np.arange(first, min(first + _MOST_LEAKS, len(offsets)))
+        leaks = np.append(rows, np.full(-len(rows) % _WIDTH, rows[-1]))  # the last offset is repeated
+        if work is None or len(work.before) != len(leaks):
+            work = SumWorkspace.with_sizes(int(samples.sizes.max()), len(onsets), len(leaks))
+        work.later[:] = 0.0
+        hold_offsets, are_equalised = (np.ascontiguousarray(table[leaks].T) for table in (offsets, is_equalised))
+        _sum_offsets(samples, hold_offsets, are_equalised, exponent, resolved, is_closed, onsets, regressors, work)
+        yield work.products[:, : N_REGRESSORS + 1, : len(rows)].copy()
 
 
 class FitWorkspace(NamedTuple):
