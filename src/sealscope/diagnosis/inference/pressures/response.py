@@ -533,9 +533,12 @@ def fit_jointly(follower: Follower, blocks: Sequence[Recording], starts: Iterabl
             cost += sums[-1].square / variance
         return sums, cost
 
-    def converge(sums: list[Block], variance: float, least_gain: float) -> list[Block]:
-        """Minimise -2 log posterior, from the `sums` over the blocks, until a step gains less than `least_gain`."""
-        damping, cost = np.zeros(len(blocks)), posterior_cost(sums, variance)
+    def converge(sums: list[Block], damping: Array, variance: float, least_gain: float) -> list[Block]:
+        """Minimise -2 log posterior, from the `sums` over the blocks, until a step gains less than `least_gain`.
+
+        `damping` (K,), that of each block, is changed in place.
+        """
+        cost = posterior_cost(sums, variance)
         for _ in range(_N_JOINT_STEPS):
             step, gain = newton_step(sums, priors, prior_precision, variance, damping)
             if not gain >= least_gain:
@@ -553,8 +556,10 @@ def fit_jointly(follower: Follower, blocks: Sequence[Recording], starts: Iterabl
                 is_good = after - expected < 0.2 * np.abs(before - expected) + 0.3 * _TOLERATED
             if new_cost < cost:
                 sums, cost = new_sums, new_cost
-            elif not is_bad.any() and not damping.any():  # the decrease is too small for the simulation's rounding
+            elif is_good.all():  # the decrease is too small for the simulation's rounding
                 break
+            else:  # a block may also fit worse by the state that an earlier one leaves
+                is_bad, is_good = ~is_good, np.zeros(len(blocks), dtype=bool)
             damping[is_bad] = np.maximum(_MORE_DAMPING * damping[is_bad], _MIN_DAMPING)
             damping[is_good] *= _LESS_DAMPING
             damping[damping < _LESS_DAMPING * _MIN_DAMPING] = 0.0
@@ -571,13 +576,10 @@ def fit_jointly(follower: Follower, blocks: Sequence[Recording], starts: Iterabl
             sums, cost = linearise(start, noise)
             if not math.isfinite(cost):
                 continue
-            sums = converge(sums, noise, _ROUGHLY)
-            joint = Joint.fit(
-                converge(sums, Joint.fit(sums, priors, prior_precision, G).noise, _CONVERGED),
-                priors,
-                prior_precision,
-                G,
-            )
+            damping = np.full(len(blocks), _MIN_DAMPING)  # the first full step nearly always goes too far
+            sums = converge(sums, damping, noise, _ROUGHLY)
+            correlated_noise = Joint.fit(sums, priors, prior_precision, G).noise
+            joint = Joint.fit(converge(sums, damping, correlated_noise, _CONVERGED), priors, prior_precision, G)
         except np.linalg.LinAlgError:
             continue
         cost = posterior_cost(sums, noise)
