@@ -188,8 +188,15 @@ def find_lowering_limits(pump_volume: Array, x: Array, pressure_difference: Arra
     The arguments are those of `flag_lowering`.
     """
     max_flow = rest_limit(pump_volume, rate)
+    return _find_limits(max_flow, find_rests(pump_volume, rate, max_flow), x, pressure_difference, rate)
+
+
+def _find_limits(
+    max_flow: float, rests: NDArray[np.bool_], x: Array, pressure_difference: Array, rate: float
+) -> LoweringLimits:
+    """Find the limits for `flag_lowering` (`find_lowering_limits`) from the pump's limit [m^3/s] and its `rests`."""
     speed_and_noise = _speed_and_noise(np.diff(x), rate)
-    load = pressure_difference[~find_rests(pump_volume, rate, max_flow)]  # while the pump turns
+    load = pressure_difference[~rests]  # while the pump turns
     np.nan_to_num(np.abs(load, out=load), copy=False)
     return LoweringLimits(
         pump=max_flow,
@@ -216,8 +223,8 @@ def flag_lowering(
     `pressure_difference` (n,): p_A - p_B [Pa] in the middle of each sampling interval, which may be
     overwritten; `rate`: sampling rate [Hz]; `limits`: by default those of the same samples.
     """
-    limits = limits or find_lowering_limits(pump_volume, x, pressure_difference, rate)
-    rests = find_rests(pump_volume, rate, limits.pump)
+    max_flow = limits.pump if limits else rest_limit(pump_volume, rate)
+    rests = find_rests(pump_volume, rate, max_flow)
     margin = math.ceil(AVERAGING_TIME * rate)
 
     def extend_both_ways(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -230,6 +237,7 @@ def flag_lowering(
     is_free = _window_sums(is_turning.view(np.int8), window) == 0
     if not is_free.any():
         return np.zeros(len(rests), dtype=bool)
+    limits = limits or _find_limits(max_flow, rests, x, pressure_difference, rate)
     usual_load = max(limits.load, np.finfo(float).tiny)
     # arrays are changed in place: a long recording has few copies
     relative_load = np.abs(pressure_difference, out=pressure_difference)

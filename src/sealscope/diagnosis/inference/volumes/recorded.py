@@ -8,6 +8,7 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sealscope.diagnosis.estimate.change import (
     MIN_BLOCKS,
@@ -182,8 +183,7 @@ class RecordedBalance:
         first = int(np.argmax(self.blocks.is_moving))
         if self.has_position_and_flow:
             rate = self.recording.rate
-            rests = find_rests(self._pumped, rate)
-            begin = float(self.recording.t[0]) + int(np.argmin(rests)) / rate
+            begin = float(self.recording.t[0]) + int(np.argmin(self._pump_rests)) / rate
             starts = self.blocks.start - half_width(rate)  # of the first test functions
             first = max(first, int(np.searchsorted(starts, begin)))
         return first if len(self.blocks) - first >= MIN_BLOCKS else 0
@@ -289,9 +289,8 @@ class RecordedBalance:
         sides = self._cylinder_sides() if is_held and self.recording.units["p_A"] != COUNTS else None
         if sides is None:
             return None
-        recording, pumped = self.recording, self._pumped
+        recording, rests = self.recording, self._pump_rests
         pressures = {name: recording[name] for name in ("p_A", "p_B")}
-        rests = find_rests(pumped, recording.rate)
         lower_pressure = np.minimum(pressures["p_A"], pressures["p_B"])
         charge = find_charge_pressure(lower_pressure, rests, recording.rate)
         # absolute minus gauge pressure; larger if sensor offsets would make the least pressure too low
@@ -324,6 +323,12 @@ class RecordedBalance:
         return compute_once(
             self.recording, ("pumped", self.rig, self.flow, self.equations[0].left), self._compute_pumped
         )
+
+    @property
+    def _pump_rests(self) -> NDArray[np.bool_]:
+        """Flags (n - 1,) of the sampling intervals in which the pump rests; computed once, as `_pumped`."""
+        key = ("pump rests", self.rig, self.flow, self.equations[0].left)
+        return compute_once(self.recording, key, lambda recording: find_rests(self._pumped, recording.rate))
 
     def _compute_pumped(self, recording: Recording) -> Array:
         """Compute the volume that the pump delivers between the samples (`_pumped`)."""

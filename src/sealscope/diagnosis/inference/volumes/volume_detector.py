@@ -456,15 +456,18 @@ class VolumeBalance:
     def observe_alone(self, recording: Recording, valves: Valves) -> Observed | None:
         """Report on a recording without a baseline; None without a balance.
 
-        `valves`: those that are assumed if the pump rests in the recording.
+        `valves`: those that are assumed if the pump rests in the recording; without rests the report is the same.
         """
         recorded = self._compute_blocks(recording)
         if recorded is None:
             balance = self.balance(recording)  # a balance without a position, or None
-        else:
-            regime = recorded.regime(-np.inf if valves is Valves.OPEN else np.inf)
-            balance = self._build_balance(recording, regime, recorded.shut)
-        return None if balance is None else self._report(balance, ())
+            return None if balance is None else self._report(balance, ())
+        regime = recorded.regime(-np.inf if valves is Valves.OPEN else np.inf)
+        return compute_once(
+            recording,
+            (self.name, self.rig, "alone", regime is recorded.open),
+            lambda samples: self._report(self._build_balance(samples, regime, recorded.shut), ()),
+        )
 
     def _report(self, balance: RecordedBalance, healthy: Sequence[RecordingSums]) -> Observed:
         """Report on a volume balance: test results, leakage, and the judged part of the recording.
