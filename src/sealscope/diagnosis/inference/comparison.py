@@ -314,8 +314,10 @@ def estimate_leak_excess(
     precision, moment = np.zeros((2, len(widths)))
     for e, roles in enumerate(columns):
         residual, nuisance, prior = subtract_reference(gram[e], reference[e], roles)
-        for index, width in enumerate(widths):
-            leak = marginal_difference(residual, [roles.leak], nuisance, prior / width**2)
+        differences, tested = residual.among(nuisance), residual.among([roles.leak])
+        coupling = residual.precision[roles.leak, nuisance][None]
+        for index, width in enumerate(widths):  # `marginal_difference`
+            leak = differences.with_prior(prior / width**2).integrate_out(coupling, tested)
             precision[index] += leak.precision[0, 0]
             moment[index] += leak.moment[0]
     is_known = precision > 0.0
