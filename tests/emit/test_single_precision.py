@@ -9,7 +9,7 @@ import sealscope as ss
 from sealscope.diagnosis.live.kernel.stream import RESULTS
 from sealscope.emit.c_export import parts_a_sample, render_c
 from sealscope.emit.run_program import CompiledStream
-from sealscope.emit.single_precision import learn_basis, measure_error
+from sealscope.emit.single_precision import convert_learned, learn_basis, measure_error
 from sealscope.emit.stream_program import stream_program
 from sealscope.errors import InputError
 
@@ -37,11 +37,15 @@ def drawn_machine(seed, rate, **options):
 
 
 def streams(unit, samples):
-    """Streams in both precisions, the columns of single precision learned from samples."""
+    """Streams in both precisions that know the machine of the samples."""
     double = CompiledStream(unit, render_c(unit, **WORDS), "leak")
     list(double.feed(samples, parts_a_sample(unit.settings)))
-    single = stream_program(unit.settings._replace(basis=learn_basis(double)))
-    return [CompiledStream(u, render_c(u, **WORDS), "leak") for u in (unit, single)]
+    program = stream_program(unit.settings._replace(basis=learn_basis(double)))
+    single = CompiledStream(program, render_c(program, **WORDS), "leak")
+    convert_learned(double, single)
+    for stream in (double, single):
+        stream.resume()
+    return double, single
 
 
 @pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 11))])
@@ -55,6 +59,23 @@ def test_single_precision_errs_by_less_than_a_tenth_of_a_deviation(seed):
     assert single.unit.state_bytes <= 48000
     assert measure_error(double, single, [samples, other]) < 0.1
     assert int(single.state.n_estimated) > 10
+
+
+def test_rests_and_a_rare_motion_err_as_little():
+    """The machine stands still, without load, for half of each minute; side B carries only the last motion's load."""
+    unit, moves = unit_at(20.0), lambda t: t % 60.0 < 30.0
+    recording = drawn_machine(
+        2,
+        20.0,
+        duration=240.0,
+        speed=lambda t: moves(t) * 12.0 * np.sin(3.0 * t),
+        load=lambda t: moves(t) * 4e5 * np.sign(180.0 - t),
+    )
+    samples = samples_of(recording)
+    double, single = streams(unit, samples)
+    assert measure_error(double, single, [samples[:3600], samples[3600:], samples]) < 0.1
+    # only blocks in motion count, as many in both
+    assert 40 < int(single.state.n_estimated) == int(double.state.n_estimated) < 70
 
 
 @pytest.mark.slow

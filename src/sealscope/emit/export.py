@@ -20,7 +20,14 @@ from sealscope.diagnosis.live.live_balance import BLOCK_SECONDS, LiveBalance, No
 from sealscope.emit.c99 import Precision
 from sealscope.emit.c_export import parts_a_sample, render_c, render_vectors
 from sealscope.emit.run_program import CompiledStream
-from sealscope.emit.single_precision import MOST_ERROR, check_error, iter_blocks, learn_basis, measure_error
+from sealscope.emit.single_precision import (
+    MOST_ERROR,
+    check_error,
+    convert_learned,
+    iter_blocks,
+    learn_basis,
+    measure_error,
+)
 from sealscope.emit.st_export import render_st
 from sealscope.emit.stream_program import StreamProgram, stream_program
 from sealscope.errors import InputError
@@ -141,10 +148,14 @@ def export_controller(
         stream, blocks = _learn(unit, samples, words)
         _check_against_watch(CompiledStream(unit, render_c(unit, **words), prefix), samples, machine)
         if precision == "single":
-            unit = stream_program(unit.settings._replace(basis=learn_basis(stream)))
-            error = _prove_single(stream.unit, unit, samples, words)
-            stream, blocks = _learn(unit, samples, words)
-        learned = stream.saved()
+            double, unit = stream, stream_program(unit.settings._replace(basis=learn_basis(stream)))
+            stream = CompiledStream(unit, render_c(unit, **words), prefix)
+            convert_learned(double, stream)
+            learned = stream.saved()
+            error = measure_error(double, stream, samples)
+            check_error(error)
+        else:
+            learned = stream.saved()
     texts: Mapping[str, str]
     if language == "c":
         texts = render_c(unit, **words, learned=learned)
@@ -268,13 +279,3 @@ def _check_against_watch(stream: CompiledStream, recordings: Sequence[Array], ri
             reason = f": {lowered}" if balance.has_lowered else ""
             got = f"{len(differing)} of {len(numbers)} blocks that differ in number {k}{reason}"
             raise InputError(f"a controller must estimate from a recording what the monitor does, got {got}")
-
-
-def _prove_single(
-    double: StreamProgram, single: StreamProgram, recordings: Sequence[Array], words: Mapping[str, Any]
-) -> float:
-    """Measure the error of single precision on recordings; raise InputError if it is not small."""
-    streams = [CompiledStream(unit, render_c(unit, **words), str(words["prefix"])) for unit in (double, single)]
-    error = measure_error(streams[0], streams[1], recordings)
-    check_error(error)
-    return error

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 import numpy as np
 
-from sealscope.diagnosis.live.coefficients import ENERGY, NOISE, ROWS
-from sealscope.diagnosis.live.kernel.stream import WINDOW, Basis
+from sealscope.diagnosis.inference.equations.expressions import channels_of
+from sealscope.diagnosis.live.coefficients import ENERGY, MOTION, NOISE, ROWS, SHIFT
+from sealscope.diagnosis.live.kernel.stream import WINDOW, Basis, StreamSettings
 from sealscope.emit.c_export import parts_a_sample
 from sealscope.emit.run_program import CompiledStream
 from sealscope.errors import InputError
@@ -22,34 +24,84 @@ MOST_ERROR = 0.1
 def learn_basis(stream: CompiledStream) -> Basis:
     """Compute the basis from what a stream in double precision has learned: the sums of its volume balance.
 
-    The nuisances are made orthogonal to each other, by a Cholesky factorisation of their products. Scales make the leak
-    of unit size, and the residuals of unit variance. The flow without a leak is subtracted from the left side.
+    Columns of one group (`_group_columns`) are made orthogonal to each other, by a Cholesky factorisation of their
+    products. Scales make the leak of unit size, and the residuals of unit variance. The flow without a leak is
+    subtracted from the left side.
     """
-    state, bias = stream.state, stream.unit.settings.bias
-    sums = np.reshape(state.model_sums, (-1, len(stream.unit.settings.expressions)))
+    state, expressions = stream.state, stream.unit.settings.expressions
+    sums = np.reshape(state.model_sums, (-1, len(expressions)))
     numbers, n = state.model_numbers, len(sums) - 2
     rows = numbers[ROWS]
-    nuisances = sums[:n, :n] - np.outer(sums[:n, n], sums[n, :n]) / sums[n, n]
-    order = [bias, *(k for k in range(n) if k != bias)]
-    products = nuisances[np.ix_(order, order)] / rows
-    factor = np.zeros((n, n))
-    for i in range(n):
-        for k in range(i):
-            factor[i, k] = (products[i, k] - factor[i, :k] @ factor[k, :k]) / factor[k, k]
-        least = max(_LEAST_PIVOT * sums[order[i], order[i]] / rows, 0.0)
-        pivot = max(products[i, i] - factor[i, :i] @ factor[i, :i], least)
-        factor[i, i] = np.sqrt(pivot) if pivot > 0.0 else 1.0
+    products = (sums[:n, :n] - np.outer(sums[:n, n], sums[n, :n]) / sums[n, n]) / rows
     combination = np.zeros((n, n))
-    combination[np.ix_(order, order)] = np.linalg.inv(factor)
-    constant = combination[:, bias].copy()
-    combination[:, bias] = 0.0
+    for group in _group_columns(stream.unit.settings):
+        factor = np.zeros((len(group), len(group)))
+        for i, column in enumerate(group):
+            for k in range(i):
+                factor[i, k] = (products[column, group[k]] - factor[i, :k] @ factor[k, :k]) / factor[k, k]
+            least = max(_LEAST_PIVOT * sums[column, column] / rows, 0.0)
+            pivot = max(products[column, column] - factor[i, :i] @ factor[i, :i], least)
+            factor[i, i] = np.sqrt(pivot) if pivot > 0.0 else 1.0
+        combination[np.ix_(group, group)] = np.linalg.inv(factor)
     return Basis(
-        constant=tuple(constant.tolist()),
         combination=tuple(float(combination[i, k]) for i in range(n) for k in range(i + 1)),
         prediction=tuple(float(stream.state.angle_sign * value) for value in state.model_values),
         leak_scale=float(np.sqrt(rows / numbers[ENERGY])),
         left_scale=float(1.0 / np.sqrt(numbers[NOISE])),
     )
+
+
+def convert_learned(double: CompiledStream, single: CompiledStream) -> None:
+    """Give a stream in single precision what one in double precision has learned, in the columns of its basis.
+
+    With the basis' matrix T and the sums S of the products of columns, those of its columns are T S T'.
+    """
+    basis, known, state = single.unit.settings.basis, double.state, single.state
+    assert basis is not None
+    unit, size = basis.conductance_unit, len(known.model_values) + 2
+    to_basis = np.zeros((size, size))
+    to_basis[np.tril_indices(size - 2)] = basis.combination
+    to_basis[-2, -2], to_basis[-1, -1] = basis.leak_scale, basis.left_scale
+    to_basis[-1, :-2] = np.multiply(basis.prediction, -basis.left_scale)
+    slow = list(single.unit.settings.column_order[single.unit.settings.n_fast :])
+    # `slow_sums` are of the flow as recorded, and the other sums of the flow with its sign
+    _fill(state.slow_sums, _transform(known.slow_sums, to_basis[np.ix_(slow, slow)]))
+    to_basis[-1, :-2] *= known.angle_sign
+    _fill(state.model_sums, _transform(known.model_sums, to_basis))
+    _fill(state.model_leak_products, basis.leak_scale * to_basis[:-2, :-2] @ np.array(known.model_leak_products))
+    _fill(state.model_values, np.zeros(size - 2))  # the left side is less their prediction
+    factors = {MOTION: basis.left_scale**2, NOISE: basis.left_scale**2, ENERGY: basis.leak_scale**2, SHIFT: 1.0 / unit}
+    for k, number in enumerate(known.model_numbers):
+        state.model_numbers[k] = number * factors.get(k, 1.0)
+    state.usual_precision = known.usual_precision * unit**2
+    for name in ("angle_sign", "has_sign", "n_weighted", "steps_count"):
+        setattr(state, name, getattr(known, name))
+    state.steps_unit = known.steps_unit / unit
+    for name in ("level", "level_variance", "squares", "log_variances", "log_weights"):
+        _fill(getattr(state, f"steps_{name}"), getattr(known, f"steps_{name}"))
+
+
+def _transform(sums: Sequence[float], matrix: Array) -> Array:
+    """Compute the sums of products of the columns that a `matrix` (m, m) makes of those of `sums` (m m,)."""
+    return np.asarray(matrix @ np.reshape(sums, matrix.shape) @ matrix.T)
+
+
+def _fill(field: Any, values: Any) -> None:
+    """Write values of any shape to an array of a state."""
+    field[:] = np.ravel(values).tolist()
+
+
+def _group_columns(settings: StreamSettings) -> list[list[int]]:
+    """Group the columns of the nuisances: those of one chamber's oil and air, which change together.
+
+    All others stay alone. A combination of columns of which one is 0 for hours, as the motion under a load that is
+    rare, would depend on the others, and its coefficient would be that of rounding errors.
+    """
+    groups: dict[object, list[int]] = {}
+    for column, expression in enumerate(settings.expressions[:-2]):
+        channels = channels_of(expression) - {"x"}
+        groups.setdefault(channels if len(channels) == 1 else column, []).append(column)
+    return [*groups.values()]
 
 
 def iter_blocks(stream: CompiledStream, samples: Array) -> Iterator[tuple[float, Array]]:
@@ -69,13 +121,12 @@ def iter_blocks(stream: CompiledStream, samples: Array) -> Iterator[tuple[float,
 def measure_error(double: CompiledStream, single: CompiledStream, recordings: Sequence[Array]) -> float:
     """Compute the largest error of single precision in any block, in standard deviations of its conductance.
 
-    Infinite where the two do not estimate the same blocks.
+    Both begin with what they have learned. Infinite where the two do not estimate the same blocks.
     """
     largest = 0.0
-    for k, samples in enumerate(recordings):
-        if k:
-            double.resume()
-            single.resume()
+    for samples in recordings:
+        double.resume()
+        single.resume()
         expected, found = dict(iter_blocks(double, samples)), dict(iter_blocks(single, samples))
         if expected.keys() != found.keys():
             return float("inf")

@@ -103,7 +103,7 @@ class StreamProgram(NamedTuple):
 
 #: Constants of the kernels in single precision: limits of rounding, least and largest numbers.
 SINGLE_CONSTANTS: Mapping[str, float] = MappingProxyType(
-    {"RIDGE": 1e-6, "ROUNDING": 1e-7, "TINY": 1e-30, "MOST_EXPLAINED": 1.0 - 1e-6, "MAX_READING": 1e12, "BEYOND": 1e32}
+    {"RIDGE": 1e-7, "ROUNDING": 1e-7, "TINY": 1e-30, "MOST_EXPLAINED": 1.0 - 1e-6, "MAX_READING": 1e12, "BEYOND": 1e32}
 )
 
 

@@ -176,12 +176,11 @@ class Basis(NamedTuple):
 
     Terms of a balance are nearly collinear; the squares of their rows have a condition number of 1e8, more than single
     precision resolves. A row u of the n nuisances (all columns but the leak and the left side) is replaced by a
-    triangular combination, which only changes what the nuisances' coefficients mean: column i becomes `constant`[i]
-    times the constant flow plus the sum over k <= i of `combination`[i (i + 1)/2 + k] u[k]. The left side becomes
-    (left - sum over j of `prediction`[j] u[j]) times `left_scale`.
+    triangular combination, which only changes what the nuisances' coefficients mean: column i becomes the sum over
+    k <= i of `combination`[i (i + 1)/2 + k] u[k]. The left side becomes (left - sum over j of `prediction`[j] u[j])
+    times `left_scale`.
     """
 
-    constant: tuple[float, ...]  # (n,)
     combination: tuple[float, ...]  # (n (n + 1)/2,)
     prediction: tuple[float, ...]  # (n,)
     leak_scale: float
@@ -199,7 +198,6 @@ class StreamSettings(NamedTuple):
     rate: float  # sampling rate [Hz]
     channels: tuple[str, ...]  # of a sample, in this order
     expressions: tuple[str, ...]  # of the terms of the balance, last of its left side
-    bias: int  # index of the constant flow in these
     # indices into `expressions`: first the `n_fast` terms fitted to each block, then the others, last the left side
     column_order: tuple[int, ...]
     n_fast: int
@@ -253,7 +251,6 @@ class StreamSettings(NamedTuple):
             rate,
             channels,
             expressions,
-            bias=int(columns.bias or 0),
             column_order=(*fast, *columns.slow, columns.left),
             n_fast=len(fast),
             piston=columns.piston,
@@ -398,7 +395,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
     channels, n_columns = settings.channels, len(settings.expressions)
     row_p_A, row_p_B, row_flow, row_x = range(len(channels))
     limit_p, _, limit_flow, limit_x = (sensor_limit(CHANNEL_UNITS[name]) for name in channels)
-    response, leak, bias = n_columns - 1, n_columns - 2, settings.bias
+    response, leak = n_columns - 1, n_columns - 2
     column_order, n_fast, all_columns = settings.column_order, settings.n_fast, tuple(range(n_columns))
     capacity = (SUPPORT + 1) * block_strides
     width = 2 * half + 2
@@ -412,7 +409,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
     basis = settings.basis
     row_width, volume = settings.row_width, settings.row_width - 1  # volume: column of the measured volume
     # without a basis the names are not used
-    constant, combination, prediction, leak_scale, left_scale = basis or ((), (), (), 1.0, 1.0)
+    combination, prediction, leak_scale, left_scale = basis or ((), (), 1.0, 1.0)
     unit = 1.0 if basis is None else basis.conductance_unit
     limits = {"MAX_READING": MAX_READING, "BEYOND": BEYOND}
     to_absolute = dict(zip(("p_A", "p_B"), settings.to_absolute, strict=True))
@@ -474,7 +471,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
         entry, left = 0, m.unfinished[slot, response]
         m.rows[place, volume] = left * left_scale
         for i in range(n_columns - 2):
-            total = constant[i] * m.unfinished[slot, bias]
+            total = 0.0
             for k in range(i + 1):
                 total += combination[entry + k] * m.unfinished[slot, k]
             entry += i + 1
@@ -839,7 +836,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
         """End the work on the closed blocks: the rows of open ones move to the beginning."""
         n_closed_rows, n_rows = int(m.n_closed_rows), int(m.n_rows)
         for r in range(n_closed_rows, n_rows):
-            for j in range(n_columns):
+            for j in range(row_width):
                 m.rows[r - n_closed_rows, j] = m.rows[r, j]
         m.n_rows = n_rows - n_closed_rows
         m.n_closed = m.n_closed_rows = m.place = 0
