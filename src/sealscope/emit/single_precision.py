@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.diagnosis.inference.equations.expressions import channels_of
+from sealscope.diagnosis.inference.equations.terms import channels_of
 from sealscope.diagnosis.live.coefficients import ENERGY, MOTION, NOISE, ROWS, SHIFT
 from sealscope.diagnosis.live.kernel.stream import WINDOW, Basis, StreamSettings
 from sealscope.emit.c_export import parts_a_sample
