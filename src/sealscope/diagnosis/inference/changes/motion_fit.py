@@ -31,7 +31,7 @@ from sealscope.diagnosis.inference.machine_states import AVERAGING_TIME, number_
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.channels import CHAMBERS
 from sealscope.recordings.recording import Array, Recording, keep_with_recording
-from sealscope.signals.smoothing import TINY, average_over
+from sealscope.signals.smoothing import TINY, average_over, medians
 
 #: Maximum number of positions between which the level is linear, and minimum number of rows for each.
 KNOTS, ROWS_PER_KNOT = 24, 10
@@ -251,7 +251,7 @@ def fit_robustly(design: Array, values: Array, columns: Sequence[int], groups: N
 
 def _robust_weight(residual: Array) -> Array:
     """Compute the weights (n,) of rows from the magnitudes of their residuals (n,) [Pa] (`fit_robustly`)."""
-    scale = WEIGHT_SCALE * float(np.median(residual)) + MIN_RESIDUAL
+    scale = WEIGHT_SCALE * float(medians(residual)) + MIN_RESIDUAL
     return np.asarray(1.0 / (1.0 + (residual / scale) ** 2))
 
 

@@ -506,18 +506,31 @@ class HeldChambers:
     def _find_piston_fit(self, exponent: float) -> PistonLeak:
         """Find the most probable onset, sensor offset and supplies for a leak past the piston with an `exponent`.
 
-        They have the highest joint posterior probability, on a grid of onsets and a grid of offsets that is refined
-        once, for each possible choice of the supplies.
+        They have the highest joint posterior probability for each possible choice of the supplies (`_fit_supplies`).
         """
-        grid, fits = self._offset_grid, list[tuple[float, PistonLeak]]()
-        for supplies in self._possible_supplies:
-            leak = PistonLeak(exponent, supplies=supplies)
-            coarse_fits = self._find_onsets(leak, grid)
-            best = int(np.argmax([posterior for posterior, _ in coarse_fits]))
-            # the first and the last point are of the coarse grid
-            refined = np.linspace(grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)], N_REFINED)[1:-1]
-            fits += [*self._find_onsets(leak, refined), coarse_fits[best]]
+        supplied = [sides for sides in self._possible_supplies if sides != NEITHER]
+        fits = [self._shut_fits[exponent], *(self._fit_supplies(exponent, sides) for sides in supplied)]
         return max(fits, key=lambda fit: fit[0])[1]  # with the highest posterior
+
+    @cached_property
+    def _shut_fits(self) -> dict[float, tuple[float, PistonLeak]]:
+        """Fits of a leak past the piston while no side is supplied (`_fit_supplies`), by the exponents of the `LAWS`.
+
+        They do not depend on the charge pressure.
+        """
+        return {exponent: self._fit_supplies(exponent, NEITHER) for exponent in LAWS}
+
+    def _fit_supplies(self, exponent: float, supplies: SideSupplies) -> tuple[float, PistonLeak]:
+        """Find the most probable onset and sensor offset of a leak past the piston; return its log posterior, and it.
+
+        They are searched on a grid of onsets, and a grid of offsets that is refined once.
+        """
+        grid, leak = self._offset_grid, PistonLeak(exponent, supplies=supplies)
+        coarse_fits = self._find_onsets(leak, grid)
+        best = int(np.argmax([posterior for posterior, _ in coarse_fits]))
+        # the first and the last point are of the coarse grid
+        refined = np.linspace(grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)], N_REFINED)[1:-1]
+        return max([*self._find_onsets(leak, refined), coarse_fits[best]], key=lambda fit: fit[0])
 
     def _find_onsets(self, leak: PistonLeak, offsets: Array) -> list[tuple[float, PistonLeak]]:
         """Find the most probable onset of a `leak` for each sensor offset; return each log posterior and leak."""
@@ -634,7 +647,10 @@ class HeldChambers:
         check valve would hide the oil that leaves a chamber, so no refilling is assumed.
         """
         # without a charge pressure check valves stay closed; if they do so anyway, the cached fits serve
-        chambers = self if self._closed_share(BOTH) == 1.0 else replace(self, charge=0.0)
+        chambers = self
+        if self._closed_share(BOTH) < 1.0:
+            chambers = replace(self, charge=0.0)
+            vars(chambers)["_shut_fits"] = self._shut_fits
         sides = (True, False)
         leaks = [[chambers._unit_outside_leak(is_A)] for is_A in sides]
         leaks += [[chambers._unit_pump_leak(is_A)] for is_A in sides]
