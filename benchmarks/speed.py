@@ -387,7 +387,7 @@ def growth(folder: Path, share: float) -> dict[str, float]:
     """Measure the exponents by which the time of a verdict, and of a commissioning, and the peak memory grow.
 
     They grow with the samples of a recording, with its channels, and with the number of healthy recordings. Three
-    channels are the least with a volume balance, three recordings the least that are checked against each other.
+    channels are the least with a volume balance, four recordings the least that are checked against each other.
     """
     names = ["p_A", "p_B", "x", "omega", "T_oil"]
     minutes, counts, widths = (15.0 * share, 30.0 * share, 60.0 * share), (2, 4, 8), (3, 4, 5)
@@ -401,8 +401,8 @@ def growth(folder: Path, share: float) -> dict[str, float]:
             [of_library("commission", press(folder, 3, length, 10.0)) for length in minutes],
         ),
         "recordings of a commissioning": (
-            (3, 6, 12),
-            [of_library("commission", press(folder, count, 15.0 * share, 10.0)) for count in (3, 6, 12)],
+            (4, 8, 16),
+            [of_library("commission", press(folder, count, 15.0 * share, 10.0)) for count in (4, 8, 16)],
         ),
     }
     exponents = {}
