@@ -75,7 +75,6 @@ from sealscope.diagnosis.inference.circuit.holds.recorded_hold import (
 from sealscope.diagnosis.inference.hypotheses import GROWTHS, LAWS
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
-from sealscope.signals.smoothing import average_over
 from sealscope.units import P_ATM
 
 #: Coarse grid of offsets of p_A - p_B [standard deviations of the prior], and number of points of the refined grid.
@@ -191,28 +190,25 @@ class HeldChambers:
     @cached_property
     def _open_log_prior(self) -> float:
         """Log prior of an open unloaded side (`_supply_log_prior`)."""
-        prior, is_A = INFERENCE.held_oil, self._unloaded_open[0] is SideSupply.OPEN
-        above = [self._is_closed(hold, hold.p_A if is_A else hold.p_B, prior.tank_pressure) for hold in self.holds]
+        prior, side = INFERENCE.held_oil, 0 if self._unloaded_open[0] is SideSupply.OPEN else 1
+        above = [self._are_closed(hold, prior.tank_pressure)[side] for hold in self.holds]
         excess = [max(float(flags.mean()) - prior.time_above_charge, 0.0) for flags in above]  # in each hold
         return math.log(prior.open_probability) - sum(excess) / prior.time_above_charge
 
-    def _is_closed(self, hold: LockedHold, p: Array, back_pressure: float = 0.0) -> NDArray[np.bool_]:
-        """Flag the samples (n,) of a hold in which no check valve refills a chamber.
+    def _are_closed(self, hold: LockedHold, back_pressure: float = 0.0) -> NDArray[np.bool_]:
+        """Flag the samples of a hold in which no check valve refills chamber A (row 0) or B (row 1), (2, n).
 
-        The averaged absolute pressure `p` (n,) [Pa] then exceeds the charge pressure by a relative and an absolute
-        margin, `held_oil.charge_margin` and `held_oil.resolution` (`priors.toml`), and by `back_pressure` [Pa].
+        The averaged absolute pressure then exceeds the charge pressure by a relative and an absolute margin,
+        `held_oil.charge_margin` and `held_oil.resolution` (`priors.toml`), and by `back_pressure` [Pa].
         """
         prior = INFERENCE.held_oil
-        steady_pressure = average_over(prior.averaging_time, p, 1.0 / float(np.diff(hold.t).mean()))
-        return np.asarray(
-            steady_pressure > self.charge * (1.0 + prior.charge_margin) + prior.resolution + back_pressure
-        )
+        limit = self.charge * (1.0 + prior.charge_margin) + prior.resolution + back_pressure
+        return np.asarray(hold.steady_pressures > limit)
 
     @cached_property
     def _above_charge(self) -> NDArray[np.bool_]:
         """Flags (2, N) of the samples of all holds in which A (row 0) or B (row 1) is above the charge pressure."""
-        flags = [[self._is_closed(hold, p) for p in (hold.p_A, hold.p_B)] for hold in self.holds]
-        return np.concatenate(flags, axis=1)
+        return np.concatenate([self._are_closed(hold) for hold in self.holds], axis=1)
 
     @cached_property
     def _possible_supplies(self) -> list[SideSupplies]:

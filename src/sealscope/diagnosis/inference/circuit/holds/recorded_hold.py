@@ -70,6 +70,12 @@ class LockedHold:
         """Mean pressures of A and B [Pa] in the last interval."""
         return float(self.p_A[self.edges[-2] :].mean()), float(self.p_B[self.edges[-2] :].mean())
 
+    @cached_property
+    def steady_pressures(self) -> Array:
+        """Pressures of A and B [Pa], averaged over `held_oil.averaging_time` (`priors.toml`), shape (2, n)."""
+        rate = 1.0 / float(np.diff(self.t).mean())
+        return average_over(INFERENCE.held_oil.averaging_time, np.array([self.p_A, self.p_B]), rate)
+
     def steepest_time(self) -> float:
         """Find the start [s] of the window in which p_A - p_B changes most.
 
