@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -192,6 +194,14 @@ def test_a_state_of_a_controller_is_small():
         doubles = sum((8 if field.kind == "real" else 4) * (field.size or 1) for field in fields)
         assert doubles <= 64000
         assert sum(4 * (field.size or 1) for field in fields) <= 48000
+
+
+def test_no_index_is_beyond_its_array():
+    """Not even in a loop without a round: clang and PLCs refuse it."""
+    unit = unit_at(16.0)
+    sizes = {field.name: field.size for field in unit.program.fields}
+    indices = re.findall(r"record->(\w+)\[(\d+)\]", render_c(unit, **WORDS)["leak.c"])
+    assert len(indices) > 20 and all(int(k) < sizes[name] for name, k in indices)
 
 
 @pytest.mark.slow

@@ -536,6 +536,8 @@ class _Body:
                     self._values[name] = Known(k)
                     self._block(node.body)
                 return
+            if isinstance(start, Constant) and isinstance(stop, Constant) and stop.value <= start.value:
+                return  # no round, in which indices might be beyond an array
             start, stop = self._steady(start, node), self._steady(stop, node)
             self._declare(name, "whole", node)
             variable = Local(name, "whole")
