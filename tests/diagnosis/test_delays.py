@@ -11,8 +11,8 @@ import pytest
 
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.estimate.interval import Interval
-from sealscope.diagnosis.inference.delays import DelayChange, SampleClock, shift_back
 from sealscope.diagnosis.inference.regimes import recorded_blocks
+from sealscope.diagnosis.inference.sensor_errors import DelayChange, SampleClock, shift_back
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording

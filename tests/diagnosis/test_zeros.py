@@ -12,7 +12,7 @@ from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.inference.block_stream import BlockStream
 from sealscope.diagnosis.inference.blocks import ColumnRoles, offset_cost, offset_penalty
 from sealscope.diagnosis.inference.equations.balances import equations
-from sealscope.diagnosis.inference.pressure_offset import area_mismatch
+from sealscope.diagnosis.inference.sensor_errors import area_mismatch
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.parameters import load_rig
 from sealscope.units import BAR

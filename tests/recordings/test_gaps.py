@@ -8,8 +8,14 @@ import numpy as np
 import pytest
 
 from sealscope.recordings import CHANNEL_UNITS, Recording
-from sealscope.recordings.corrections.clock import order_recording, resample_evenly
-from sealscope.recordings.corrections.gaps import bridge, flag_bridged, flag_holes, remove_unsupplied
+from sealscope.recordings.corrections.gaps import (
+    bridge,
+    flag_bridged,
+    flag_holes,
+    order_recording,
+    remove_unsupplied,
+    resample_evenly,
+)
 
 RATE, NOISE = 500.0, 1e3
 NEEDED = ("u", "p_A", "p_B")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sealscope.recordings import quality
-from sealscope.recordings.stretches import (
+from sealscope.recordings.channels import (
     finite_range,
     iter_stretches,
     largest_steps,

@@ -19,7 +19,7 @@ from sealscope.diagnosis.inference.machine_states import find_rests
 from sealscope.diagnosis.inspection import inspect_recording
 from sealscope.parameters import Rig
 from sealscope.recordings.channels import flow_source
-from sealscope.recordings.corrections.clock import order_recording, resample_evenly
+from sealscope.recordings.corrections.gaps import order_recording, resample_evenly
 from sealscope.recordings.corrections.unsigned import is_one_sided
 from sealscope.recordings.quality import Severity
 from sealscope.recordings.recording import Array, Recording

@@ -19,12 +19,22 @@ from numpy.typing import NDArray
 
 from sealscope.calls import checked_call
 from sealscope.paragraphs import format_count
-from sealscope.recordings.channels import CHAMBERS, COUNTS, METERS, SLOW, UNUSED, Array, chambers_of, smallest_step
+from sealscope.recordings.channels import (
+    CHAMBERS,
+    COUNTS,
+    METERS,
+    SLOW,
+    UNUSED,
+    Array,
+    chambers_of,
+    iter_stretches,
+    smallest_step,
+    summarize_intervals,
+)
 from sealscope.recordings.formats.headings.labels import Label, is_pressure
 from sealscope.recordings.motion import find_runs, find_stuck, is_constant
 from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.recording import Recording
-from sealscope.recordings.stretches import iter_stretches, summarize_intervals
 
 Severity = Literal["note", "warning", "fatal"]
 

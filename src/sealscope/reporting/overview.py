@@ -8,10 +8,9 @@ from itertools import pairwise
 import numpy as np
 
 from sealscope.paragraphs import WIDTH, paragraph
-from sealscope.recordings.channels import LONG_NAMES, Array
+from sealscope.recordings.channels import LONG_NAMES, Array, finite_range
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
-from sealscope.recordings.stretches import finite_range
 from sealscope.reporting.charts import display_values
 
 _BARS = "▁▂▃▄▅▆▇█"

@@ -22,10 +22,10 @@ from sealscope.diagnosis.inference.changes.features import SENSOR_FEATURES, obse
 from sealscope.diagnosis.inference.changes.healthy_levels import DRIFTS, FRICTION, ZEROS
 from sealscope.diagnosis.inference.changes.level_changes import PATTERNS
 from sealscope.diagnosis.inference.changes.volumes import OUTSIDE, SCALE
-from sealscope.diagnosis.inference.delays import DELAYED
 from sealscope.diagnosis.inference.equations.balances import circulation, equations, locked
 from sealscope.diagnosis.inference.equations.terms import AIR, BIAS, TURNING, delay_name
 from sealscope.diagnosis.inference.pressures.reduced_rig import PARAMETERS
+from sealscope.diagnosis.inference.sensor_errors import DELAYED
 from sealscope.diagnosis.inference.volumes.volume_detector import TURNING_DATA
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.diagnosis.rms_change.rms_detector import JUDGED

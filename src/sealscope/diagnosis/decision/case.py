@@ -38,12 +38,12 @@ from sealscope.diagnosis.decision.explanations import (
 )
 from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.estimate.population import weigh_alternatives
+from sealscope.diagnosis.estimate.special import find_root
 from sealscope.diagnosis.inference.comparison import RISE
 from sealscope.diagnosis.inference.observable import LeakMeasure, Observable, Observed
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.evidence import AGAINST, WITHIN
 from sealscope.diagnosis.verdict.severity import joint_causes
-from sealscope.evaluation.scalar_search import find_root
 from sealscope.recordings.recording import Array
 
 #: Number of values of lambda that the calibrated chance sums over, in addition to 1.

@@ -65,8 +65,7 @@ from numpy.typing import NDArray
 from sealscope.compiled import kernel, law
 from sealscope.diagnosis.estimate.interval import WITHIN_95, Estimate, Interval
 from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY, weigh_alternatives
-from sealscope.diagnosis.estimate.special import log_scaled_tail
-from sealscope.evaluation.scalar_search import find_root
+from sealscope.diagnosis.estimate.special import find_root, log_scaled_tail
 from sealscope.recordings.recording import Array
 
 #: Minimum number of blocks, for a level, a slope, a step and its standard error.

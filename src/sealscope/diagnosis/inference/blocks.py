@@ -126,7 +126,7 @@ class Blocks:
     pressures : array of float, shape (K, p)
         Means of p equal parts of the sorted samples of p_A - p_B [Pa], as recorded (`sorted_part_means`).
     zero : array of float, shape (K,)
-        Sensor offset [Pa] that was subtracted from p_A - p_B in `gram` (`pressure_offset.remove_pressure_offset`), the
+        Sensor offset [Pa] that was subtracted from p_A - p_B in `gram` (`sensor_errors.remove_pressure_offset`), the
         same in all blocks of a recording.
     """
 
@@ -552,7 +552,7 @@ class _Sums(NamedTuple):
         return _Sums(*(np.empty(shape) for shape in ((size, size), size, (n_blocks, size), n_blocks, n_blocks)))
 
     def normal_equations(self, gram: Array, left: int) -> _NormalEquations:
-        """Make the normal equations with these sums; `gram`, `left`: as in `_build_normal_equations`."""
+        """Make the normal equations of a regression from its sums; `gram`, `left`: as in `_build_normal_equations`."""
         nuisance = Gaussian(self.precision, self.moment, float(gram[:, left, left].sum()))
         return _NormalEquations(nuisance, self.coupling, self.energy, self.tested_moment)
 
@@ -746,7 +746,7 @@ def _fit_equation(blocks: Blocks, equation: int, roles: ColumnRoles, test: int) 
 
     The tested coefficient g is free in each block. The leakage is g (p_A - p_B - z) = g (p_A - p_B) - g z. A change of
     g between blocks also changes the constant flow -g z, and so reveals z. z is small, since a first estimate of the
-    offset is already removed from the Gram matrices (`pressure_offset.remove_pressure_offset`).
+    offset is already removed from the Gram matrices (`sensor_errors.remove_pressure_offset`).
 
     `test`: column of g. The result is cached for the last blocks.
     """

@@ -7,7 +7,7 @@
 | held load without a flow | creeps by leakage, a loop holds it | equal | `RecordedBalance.creep_log_odds` | `CREEP` |
 | flow at rest | circulates, holds the load | `feed.circulation_odds` | `balances.flag_circulation` | `HoldCounts` |
 | chambers that a pump feeds | both, one at a time, each by its displacement | `feed` | `FeedSums.find_feed` | |
-| zero of p_A - p_B | near 0, any | `zero` | `pressure_offset` | |
+| zero of p_A - p_B | near 0, any | `zero` | `fit_pressure_offset` | |
 | law of a leak | exponent of its flow | `size.laminar` | `leak_flow`, `comparison` | `LAWS` |
 | course of a leak | growth from its onset to the end | `growth` | `leak_flow`, `HeldChambers` | `GROWTHS` |
 

@@ -334,7 +334,7 @@ def extend_flags(starts: NDArray[np.bool_], length: int) -> NDArray[np.bool_]:
 
 
 def _count_flags(flags: NDArray[np.bool_], length: int) -> NDArray[np.int32]:
-    """Count the flagged samples among each sample and the `length` - 1 before it, shape (n,)."""
+    """Count, for each sample, the flags of itself and of the `length` - 1 samples before it, shape (n,)."""
     counts = np.cumsum(flags, dtype=np.int32)
     counts[length:] -= counts[:-length].copy()
     return counts

@@ -35,13 +35,6 @@ from sealscope.diagnosis.estimate.linear import Gaussian, solve
 from sealscope.diagnosis.estimate.population import normal_log_density
 from sealscope.diagnosis.inference.block_stream import MAX_BLOCK_TIME, MIN_BLOCK_TIME, BlockStream
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
-from sealscope.diagnosis.inference.delays import (
-    DelayChange,
-    DelayTest,
-    SampleClock,
-    align_samples,
-    drop_delay_columns,
-)
 from sealscope.diagnosis.inference.equations.balances import (
     READ,
     FeedSums,
@@ -69,8 +62,13 @@ from sealscope.diagnosis.inference.equations.terms import (
     Signals,
 )
 from sealscope.diagnosis.inference.hypotheses import HoldCounts, Valves
-from sealscope.diagnosis.inference.pressure_offset import (
+from sealscope.diagnosis.inference.sensor_errors import (
+    DelayChange,
+    DelayTest,
+    SampleClock,
+    align_samples,
     area_mismatch,
+    drop_delay_columns,
     fit_pressure_offset,
     remove_pressure_offset,
 )
@@ -288,7 +286,7 @@ class RecordedBlocks(NamedTuple):
         return self._replace(open=self.open.reverse_flow(is_reversed), shut=shut)
 
     def regime(self, odds: float) -> RegimeBlocks:
-        """Return the blocks for shut valves if there are any and `odds`, their log odds, is positive; else for open."""
+        """Choose the blocks for shut valves if there are any and their log `odds` are positive, else those for open."""
         return self.shut if self.shut is not None and odds > 0.0 else self.open
 
 

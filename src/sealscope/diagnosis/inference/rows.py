@@ -109,8 +109,9 @@ def row_weight(interval: int, n_stride: int, peak: float) -> float:
 def add_to_rows(unfinished: Any, increments: Any, k: int, n_stride: int, peak: float) -> None:
     """Add the increments (c,) over sampling interval k, weighted by the test function, to the rows that contain it.
 
-    The row that began `age` strides ago is at its number modulo `SPAN` of `unfinished` (SPAN, c); a new one begins at
-    0. At the end of a stride, row k // `n_stride` - `SPAN` + 1 is finished. Streams and files sum in this order.
+    Row r begins with stride r and lasts `SPAN` strides. Its sums are in `unfinished` (SPAN, c), at the place r modulo
+    `SPAN`, and begin at 0. At the end of a stride, row k // `n_stride` - `SPAN` + 1 is finished. Streams and files sum
+    in this order.
     """
     stride, k_in_stride = k // n_stride, k % n_stride
     if k_in_stride == 0:

@@ -24,9 +24,9 @@ from sealscope.diagnosis.inference.changes.volumes import VOLUMES, volume_observ
 from sealscope.diagnosis.inference.equations.balances import equations, shut_at_rest
 from sealscope.diagnosis.inference.equations.terms import PUMP, STATES, Equation, Flow
 from sealscope.diagnosis.inference.observable import Observable
-from sealscope.diagnosis.inference.pressure_offset import remove_pressure_offset
 from sealscope.diagnosis.inference.regimes import NEGLIGIBLE
 from sealscope.diagnosis.inference.rows import stride_samples
+from sealscope.diagnosis.inference.sensor_errors import remove_pressure_offset
 from sealscope.diagnosis.live.coefficients import (
     MIN_REST_PRECISION,
     MISFIT,

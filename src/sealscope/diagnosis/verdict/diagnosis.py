@@ -204,7 +204,7 @@ class Diagnosis(Evidence):
 
     @property
     def named_cause(self) -> str | None:
-        """The `cause` if it agrees with the verdict, i.e. is one of `LEAKS` for the verdict `leak` only; else None."""
+        """The `cause` if it fits the verdict: one of `LEAKS` with `leak`, another one with the others; else None."""
         return self.cause if (self.verdict == LEAK) == (self.cause in LEAKS) else None
 
     @property

@@ -22,14 +22,15 @@ from numpy.typing import NDArray
 
 from sealscope.paragraphs import format_count
 from sealscope.recordings.channels import CHAMBERS, COUNTS, SLOW, Array, chambers_of, estimate_quantum
-from sealscope.recordings.corrections.clock import order_recording, resample_evenly
 from sealscope.recordings.corrections.gaps import (
     bridge,
     flag_holes,
     interpolate_short_gaps,
+    order_recording,
     remove_dropouts,
     remove_impossible,
     remove_unsupplied,
+    resample_evenly,
     set_missing,
 )
 from sealscope.recordings.corrections.unsigned import restore_signs

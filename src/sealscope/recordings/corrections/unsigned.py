@@ -22,11 +22,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from sealscope.recordings.channels import Array
+from sealscope.recordings.channels import Array, finite_range, iter_stretches
 from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.quality import Finding, Severity
 from sealscope.recordings.recording import Recording
-from sealscope.recordings.stretches import finite_range, iter_stretches
 
 _PRIORS = RECORDINGS.unsigned
 _MAX_ITERATIONS = 10  # most iterations of the fit; each uses the signs of the previous one

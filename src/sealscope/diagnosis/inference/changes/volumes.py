@@ -24,7 +24,6 @@ from sealscope.diagnosis.inference.blocks import (
     sum_blocks,
 )
 from sealscope.diagnosis.inference.changes.charge_pressure import ChargeTrend
-from sealscope.diagnosis.inference.delays import DELAYED, DelayChange, DelayTest
 from sealscope.diagnosis.inference.equations.terms import (
     AIR,
     BIAS,
@@ -41,6 +40,7 @@ from sealscope.diagnosis.inference.equations.terms import (
 from sealscope.diagnosis.inference.hypotheses import LAWS, step_penalty
 from sealscope.diagnosis.inference.leak_flow import apparent_conductances
 from sealscope.diagnosis.inference.observable import Observable
+from sealscope.diagnosis.inference.sensor_errors import DELAYED, DelayChange, DelayTest
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 

@@ -666,9 +666,9 @@ def shut_at_rest(equation: Equation) -> Equation:
 
 
 def with_delays(equation: Equation) -> Equation:
-    """Add terms of the delays of the position, unless the balance has `LAG`, and of the chamber pressures (`delays`).
+    """Add terms of the delays of the position, unless the balance has `LAG`, and of the chamber pressures.
 
-    A pressure counts in the balances that contain the compliance of its chamber.
+    They are tested in `sensor_errors`. A pressure counts in the balances that contain the compliance of its chamber.
     """
     terms = []
     if LAG not in (term.name for term in equation.terms):

@@ -43,7 +43,6 @@ from sealscope.diagnosis.inference.circuit.holds.recorded_hold import (
 )
 from sealscope.diagnosis.inference.circuit.without_position import recorded_oil_loss_tests
 from sealscope.diagnosis.inference.comparison import RecordingSums, block_weights
-from sealscope.diagnosis.inference.delays import DelayChange, DelayTest
 from sealscope.diagnosis.inference.equations.balances import (
     READ,
     derive_drive_signals,
@@ -74,6 +73,7 @@ from sealscope.diagnosis.inference.machine_states import extend_rests, find_rest
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.regimes import RegimeBlocks, fit_with_robust_covariance, rest_log_odds
 from sealscope.diagnosis.inference.rows import half_width
+from sealscope.diagnosis.inference.sensor_errors import DelayChange, DelayTest
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import RAREST
 from sealscope.diagnosis.verdict.machine_sizes import measures_flow

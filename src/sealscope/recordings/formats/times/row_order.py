@@ -11,7 +11,7 @@ this order:
 6. The logger restarts: the parts follow each other in the order of the file, after a pause of unknown length, for which
    `clock.pause` of `priors.toml` is assumed.
 
-Called where files are read (`timebase.time_base`, `table`), and by `corrections.clock` for other recordings.
+Called where files are read (`timebase.time_base`, `table`), and by `corrections.gaps` for other recordings.
 """
 
 from __future__ import annotations
@@ -23,9 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.paragraphs import format_count
-from sealscope.recordings.channels import Array
+from sealscope.recordings.channels import Array, summarize_intervals
 from sealscope.recordings.priors import RECORDINGS
-from sealscope.recordings.stretches import summarize_intervals
 
 _PRIORS = RECORDINGS.clock
 _HOUR, _DAY = 3600.0, 86400.0  # [s]

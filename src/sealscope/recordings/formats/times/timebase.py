@@ -22,12 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.errors import InputError
-from sealscope.recordings.channels import Array
+from sealscope.recordings.channels import Array, iter_stretches, summarize_intervals, take_finite
 from sealscope.recordings.formats.headings.labels import WORDS, Label
 from sealscope.recordings.formats.headings.preamble import scope_start
 from sealscope.recordings.formats.times import row_order
 from sealscope.recordings.formats.times.row_order import ClockEvent, OrderedRows, Wrap, order_rows
-from sealscope.recordings.stretches import iter_stretches, summarize_intervals, take_finite
 from sealscope.storage.opening import open_regular
 from sealscope.units import same_dimension, to_si
 

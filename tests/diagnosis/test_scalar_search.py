@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 from scipy.special import betainc, ndtr
 
-from sealscope.evaluation.scalar_search import find_minimum, find_root
+from sealscope.diagnosis.estimate.special import find_minimum, find_root
 
 FUNCTIONS = {
     "cubic": (lambda x: x**3 - 2.0, 0.0, 2.0),
