@@ -2,8 +2,8 @@
 
 Every module that asks when pump or piston rest finds it here, from the increments of the pump's volume and of the
 piston's position between samples. A rest is a time of at least `MIN_REST` in which the speed, averaged over
-`AVERAGING_TIME`, stays below a limit (`rest_limit`); the rests of pump and piston together are the states
-(`MachineStates`):
+`AVERAGING_TIME`, stays below a limit (`rest_limit`); the rests of pump and piston together are the states of
+`terms.Signals`:
 
 | pump | piston | state |
 | --- | --- | --- |
@@ -76,35 +76,6 @@ class LoweringLimits(NamedTuple):
         share = other.time / time if time > 0.0 else 0.5
         means = [(1.0 - share) * mine + share * theirs for mine, theirs in zip(self, other, strict=True)]
         return LoweringLimits(*means)._replace(time=time)
-
-
-class MachineStates(NamedTuple):
-    """Flags of the n sampling intervals in which the pump rests, and in which the piston rests, (n,) each."""
-
-    pump_rests: NDArray[np.bool_]
-    piston_rests: NDArray[np.bool_]
-
-    @property
-    def moving(self) -> NDArray[np.bool_]:
-        """Flags (n,) of the intervals in which pump and piston move."""
-        return ~self.pump_rests & ~self.piston_rests
-
-    @property
-    def holding(self) -> NDArray[np.bool_]:
-        """Flags (n,) of the intervals in which the pump turns and the piston rests."""
-        return ~self.pump_rests & self.piston_rests
-
-
-def find_states(pump_volume: Array, piston_step: Array, rate: float, limits: RestLimits) -> MachineStates:
-    """Find the states of a machine below the `limits` of a rest.
-
-    `pump_volume`, `piston_step` (n,): increments of the pump's volume [m^3] and of the piston's position [m] in each
-    sampling interval, NaN where missing; `rate`: sampling rate [Hz].
-    """
-    return MachineStates(
-        find_rests(pump_volume, rate, limits.pump, limits.shortest),
-        find_rests(piston_step, rate, limits.piston, limits.shortest),
-    )
 
 
 def find_rests(

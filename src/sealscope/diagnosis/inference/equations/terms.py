@@ -40,7 +40,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.compiled import kernel
-from sealscope.diagnosis.inference.machine_states import MachineStates, RestLimits, find_states
+from sealscope.diagnosis.inference.machine_states import RestLimits, find_rests
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.recordings.channels import CHANNEL_UNITS
@@ -76,7 +76,7 @@ class Signals:
     ) -> None:
         self._channels, self.rate, self._to_absolute, self._offset = channels, rate, to_absolute or {}, offset
         self._rest_limits = rest_limits
-        self._states: MachineStates | None = None
+        self._rests: tuple[NDArray[np.bool_], NDArray[np.bool_]] | None = None  # of the pump, and of the piston
         self._steps, self._means = dict[str, Array](), dict[str, Array]()
 
     def __contains__(self, name: object) -> bool:
@@ -178,22 +178,28 @@ class Signals:
         `pump_volume` computes the left side of the volume balance [m^3] in each interval; later calls use that of the
         first one. Without `rest_limits` all intervals count as motion.
         """
-        states = self._find_states(pump_volume)
-        return np.ones_like(self.time_step) if states is None else states.moving.astype(float)
+        rests = self._find_rests(pump_volume)
+        return np.ones_like(self.time_step) if rests is None else (~rests[0] & ~rests[1]).astype(float)
 
     def holding(self, pump_volume: Callable[[Signals], Array]) -> Array:
         """Return 1 for each sampling interval (n - 1,) in which the pump turns and the piston rests, else 0.
 
         `pump_volume`: as in `moving`. Without `rest_limits` the piston never rests.
         """
-        states = self._find_states(pump_volume)
-        return np.zeros_like(self.time_step) if states is None else states.holding.astype(float)
+        rests = self._find_rests(pump_volume)
+        return np.zeros_like(self.time_step) if rests is None else (~rests[0] & rests[1]).astype(float)
 
-    def _find_states(self, pump_volume: Callable[[Signals], Array]) -> MachineStates | None:
-        """Find the states of the machine once, for later calls, too; None without `rest_limits`."""
-        if self._states is None and self._rest_limits is not None:
-            self._states = find_states(pump_volume(self), self.step("x"), self.rate, self._rest_limits)
-        return self._states
+    def _find_rests(
+        self, pump_volume: Callable[[Signals], Array]
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]] | None:
+        """Flag the rests of the pump and those of the piston, for later calls, too; None without `rest_limits`."""
+        limits = self._rest_limits
+        if self._rests is None and limits is not None:
+            self._rests = (
+                find_rests(pump_volume(self), self.rate, limits.pump, limits.shortest),
+                find_rests(self.step("x"), self.rate, limits.piston, limits.shortest),
+            )
+        return self._rests
 
 
 def central_difference(values: Array, half_width: int) -> Array:
