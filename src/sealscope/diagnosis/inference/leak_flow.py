@@ -46,7 +46,7 @@ from numpy.typing import NDArray
 
 from sealscope.diagnosis.estimate.change import Information, StepTest, bound_steps, step_shapes, step_sizes, step_test
 from sealscope.diagnosis.estimate.interval import Estimate
-from sealscope.diagnosis.estimate.linear import Gaussian
+from sealscope.diagnosis.estimate.linear import Gaussian, limit_precisions
 from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY, normal_log_density, weigh_alternatives
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.equations.terms import HOLDING, ORIFICE, TURNING
@@ -534,7 +534,7 @@ def _prior_precision(roles: ColumnRoles, total: Array, columns: list[int], state
     deviations[: roles.left] = roles.level_deviations(total[: roles.left + 1, : roles.left + 1])
     deviations[roles.leak] = np.inf  # the total is what is estimated
     with np.errstate(over="ignore"):
-        precision = np.diag(np.minimum(variance / deviations[columns] ** 2, 1e9 * np.diag(total)[columns]))
+        precision = np.diag(limit_precisions(variance / deviations[columns] ** 2, total[np.ix_(columns, columns)]))
     if len(states) == 2 and all(state in columns for state in states):
         pair = [columns.index(state) for state in states]
         # one coefficient for both states: the sum of their columns takes the place of the first
