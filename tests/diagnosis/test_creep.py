@@ -1,7 +1,8 @@
-"""A load that valves hold and whose command nobody records: it creeps by what leaks, and healthy days show that."""
+"""A load that valves hold and whose flow nobody records: it creeps by what leaks, and healthy days show that."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -45,10 +46,29 @@ def record_boom(
     return Recording(t, channels, {"p_A": "Pa", "p_B": "Pa", "x": "m"}, RATE)
 
 
-def commission(folder: Path, count: int = 5, *, is_held: bool = False, compliance: float = 0.0) -> CommissionedMachine:
+def add_joystick(recording: Recording, seed: int) -> Recording:
+    """Add the voltage of the joystick that moves the boom: it has a dead band, and the speed falls with the load.
+
+    Dead band, noise and the pressure before the valve are drawn at random.
+    """
+    random = np.random.default_rng([seed, 1])
+    phase = recording.t % 12.0
+    speed = np.where(phase < 3.0, np.gradient(recording["x"], recording.t), 0.0)
+    supply = random.uniform(8e6, 12e6)
+    drop = np.where(speed > 0.0, supply - recording["p_A"], recording["p_A"])
+    opening = speed / 0.16 * np.sqrt(0.5 * supply / drop)
+    u = np.where(phase < 3.0, random.uniform(0.2, 1.0) * np.sign(speed), 0.0) + 8.0 * opening
+    u += random.choice([0.0, 0.01, 0.03]) * random.standard_normal(u.size)
+    return replace(recording, channels={**recording.channels, "u": u}, units={**recording.units, "u": "V"})
+
+
+def commission(
+    folder: Path, count: int = 5, *, is_held: bool = False, compliance: float = 0.0, has_joystick: bool = False
+) -> CommissionedMachine:
     """Commission the boom from healthy recordings, with its piston areas stated."""
     for seed in range(count):
-        ss.write(record_boom(seed, is_held=is_held, compliance=compliance), folder / f"healthy-{seed}.nc")
+        recording = record_boom(seed, is_held=is_held, compliance=compliance)
+        ss.write(add_joystick(recording, seed) if has_joystick else recording, folder / f"healthy-{seed}.nc")
     rig = unstated_rig().with_areas(AREA_A, AREA_B, source="data sheet")
     return ss.commission(folder, rig=rig)
 
@@ -107,3 +127,26 @@ def test_nothing_is_said_where_a_loop_may_hold_the_load(tmp_path: Path, boom: Co
     assert held.diagnose(record_boom(23, WORN, is_held=True)).verdict == "cannot tell"
     assert boom.rig is not None
     assert ss.diagnose(record_boom(24, WORN), rig=boom.rig).verdict == "cannot tell"
+
+
+def test_a_joystick_leaves_the_creep_to_show_the_leak(tmp_path: Path) -> None:
+    """A valve's command is no flow of a pump: the holds show the leak as closely as without it."""
+    boom = commission(tmp_path, has_joystick=True)
+    healthy = boom.diagnose(add_joystick(record_boom(22), 22))
+    assert healthy.summary == "no leak"
+    assert healthy.bound_lpm is not None
+    assert healthy.bound_lpm < flow_lpm(record_boom(22), VALVES)
+    recording = record_boom(20, WORN)
+    diagnosis = boom.diagnose(add_joystick(recording, 20))
+    assert (diagnosis.verdict, diagnosis.cause) == ("leak", "piston or external leak")
+    assert diagnosis.leak_interval_lpm is not None
+    assert diagnosis.leak_interval_lpm[0] < flow_lpm(recording, WORN) < diagnosis.leak_interval_lpm[1]
+
+
+@pytest.mark.slow
+def test_a_joystick_tells_no_creep_where_a_loop_holds_the_load(tmp_path: Path) -> None:
+    held = commission(tmp_path, 3, is_held=True, has_joystick=True)
+    for seed in (23, 24):
+        diagnosis = held.diagnose(add_joystick(record_boom(seed, is_held=True), seed))
+        assert diagnosis.verdict != "leak"
+        assert diagnosis.bound_lpm is None or diagnosis.bound_lpm > flow_lpm(record_boom(seed), WORN)

@@ -46,7 +46,7 @@ from sealscope.diagnosis.inference.equations.balances import (
     samples_without_holes,
 )
 from sealscope.diagnosis.inference.equations.terms import LEAK, ORIFICE, Equation, Flow, Signals
-from sealscope.diagnosis.inference.machine_states import find_holds
+from sealscope.diagnosis.inference.machine_states import find_holds, find_rests, rest_limit
 from sealscope.diagnosis.inference.rows import Rows
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.motion import estimate_period, fundamental_frequency
@@ -60,6 +60,8 @@ if TYPE_CHECKING:
 _PRIORS = INFERENCE.held
 #: Half-width of the test functions over holds [s].
 HOLD_HALF_WIDTH: float = _PRIORS.half_width
+#: Fraction of the commands in motion that are nearer to the null than those that count as the least ones.
+NULL_QUANTILE = 0.1
 #: Channels that these balances read: none of their terms needs the pressures at the ports.
 _READ = tuple(name for name in READ if name not in ("p_1", "p_2"))
 
@@ -106,11 +108,18 @@ def cycle_balances(recording: Recording, rig: Rig) -> list[CycleBalance]:
         return []
     single_rod = rig.cylinder.single_rod
     # behind shut valves the piston is held while the command is constant; a control loop may hold it at any command
-    may_hold = is_known & (signals.step("u") == 0.0) if is_locked and "u" in channels else is_known
+    is_constant = np.ones_like(is_known)
     # fastest flow of a piston that creeps behind shut valves; a flow up to this limit counts as a hold
     max_creep = _PRIORS.creep_speed * max(rig.cylinder.A_A, rig.cylinder.A_B) if is_locked else 0.0
+    is_stated_valve = "u" in channels and rig.circuit.holds_load
+    if is_locked and is_stated_valve:
+        is_constant = signals.step("u") == 0.0  # the least change may feed the load
+    elif is_locked and "u" in channels:
+        is_constant = _find_command_rests(signals)
+        max_creep = max(max_creep, rest_limit(equation.left(signals), recording.rate, _PRIORS.held_speed))
+    may_hold = is_known & is_constant
     is_held = is_known & find_holds(np.where(may_hold, flow, np.inf), recording.rate, min_limit=max_creep)
-    if is_locked and "u" not in channels and not is_held.all():
+    if is_locked and not is_stated_valve and not is_held.all():
         first_motion = int(np.argmin(is_held))
         is_held[:first_motion] = False  # the machine may be off before the first motion
     cycle = None if is_locked else cycle_length(np.where(is_known, flow, 0.0), recording.rate)
@@ -124,6 +133,29 @@ def cycle_balances(recording: Recording, rig: Rig) -> list[CycleBalance]:
             oil_loss = {} if is_locked else oil_loss_tests(signals, rig, cycle, begin)
             balances.append(CycleBalance(blocks, equation, ColumnRoles(equation), oil_loss))
     return balances
+
+
+def _find_command_rests(signals: Signals) -> NDArray[np.bool_]:
+    """Flag the sampling intervals (n - 1,) in which a constant command u is near its null, where a valve is shut.
+
+    The null is the middle between the commands that move the piston out and in, of which the fraction `NULL_QUANTILE`
+    is nearer to it. u may differ from it by the fraction `held.null_distance` (`priors.toml`) of the distance between
+    them: a control loop that feeds what leaks has a larger command. Nothing is flagged without motion both ways.
+    """
+    step, command = signals.step("x"), signals.mean("u")
+    is_moving = ~find_rests(step, signals.rate, rest_limit(step, signals.rate, _PRIORS.held_speed))
+    is_known = is_moving & np.isfinite(step * command)
+    outward, inward = command[is_known & (step > 0.0)], command[is_known & (step < 0.0)]
+    if not (outward.size and inward.size):
+        return np.zeros_like(is_moving)
+    sense = np.sign(np.median(outward) - np.median(inward))
+    least_outward, least_inward = (
+        float(np.quantile(sense * outward, NULL_QUANTILE)),
+        float(np.quantile(sense * inward, 1.0 - NULL_QUANTILE)),
+    )
+    distance = np.abs(sense * command - 0.5 * (least_outward + least_inward))
+    is_near_null = distance < _PRIORS.null_distance * (least_outward - least_inward)
+    return np.asarray(find_rests(signals.step("u"), signals.rate) & is_near_null)
 
 
 def _build_blocks(

@@ -591,14 +591,16 @@ def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
     The left side is the volume that must have leaked from A to B to let the piston move: -dx times the piston's area
     on the loaded side, where x is assumed to grow as A fills. Leaks of seal, valve and line cannot be separated.
 
-    If a command or the pump's flow is recorded, the circuit must have valves that hold the load, and the command must
-    be recorded: it is constant while they are shut. If neither is recorded, any circuit is accepted, although a control
-    loop may then hold the load and replace the leaking oil.
+    If the pump's flow is recorded, the circuit must have valves that hold the load, and the command must be recorded:
+    it is constant while they are shut. If the command alone is recorded, nobody may state the displacement of a pump
+    otherwise, as the command may then be that of a valve. If neither is recorded, any circuit is accepted, although a
+    control loop may then hold the load and replace the leaking oil.
     """
     if not {"x", *PRESSURES} <= channels:
         return None
-    has_flow = flow_source(channels) is not None  # a command, or a flow of the pump
-    if has_flow and not (rig.circuit.holds_load and "u" in channels):
+    source = flow_source(channels)  # the pump's flow, or else the command
+    may_be_shut = rig.circuit.holds_load or (source == "u" and not rig.states("pump.q_b"))
+    if source is not None and not (may_be_shut and "u" in channels):
         return None
     areas = {"A": rig.cylinder.A_A, "B": rig.cylinder.A_B}
 

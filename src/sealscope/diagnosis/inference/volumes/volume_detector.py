@@ -300,6 +300,8 @@ class VolumeBalance:
         """
         if not equations(self.rig, frozenset(recording.channels)):
             balance = self._balance_without_position(recording)
+        elif odds.creep > 0.0 and (creeping := self._balance_of_creep(recording)) is not None:
+            balance = creeping
         elif (recorded := self._compute_blocks(recording, odds.holds)) is None:
             return None
         else:
@@ -324,6 +326,31 @@ class VolumeBalance:
         )
         usable = (balance for balance in candidates if balance.flow is Flow.CREEP or compensates_leakage(balance))
         return min(usable, key=lambda balance: BalanceLeak(balance).bound_flow, default=None)
+
+    def _balance_of_creep(self, recording: Recording) -> RecordedBalance | None:
+        """Set up the volume balance of a load that creeps under a constant command, if no channel but u shows a flow.
+
+        A command shows the flow of a pump only roughly, and that of a valve depends on the load as well. Return None if
+        a flow is recorded, or if no load is held.
+        """
+        channels = frozenset(recording.channels)
+        is_by_command = any(balance.flow is Flow.COMMAND for balance in equations(self.rig, channels))
+        if not is_by_command or locked(self.rig, channels) is None:
+            return None
+        return self._balance_without_position(recording)
+
+    def _learn_balance(self, recording: Recording) -> tuple[RecordedBalance | None, RecordedBlocks | None]:
+        """Choose the balance of a healthy recording, which other recordings of its machine may choose otherwise.
+
+        The second result is None if it is one without a position, or of a load that creeps (`_balance_of_creep`).
+        """
+        creeping = self._balance_of_creep(recording)
+        if creeping is not None and creeping.creep_log_odds() > 0.0:
+            return creeping, None
+        recorded = self._compute_blocks(recording)
+        if recorded is None:
+            return self.balance(recording), None
+        return self._build_balance(recording, recorded.open), recorded
 
     def _compute_blocks(self, recording: Recording, healthy_holds: HoldCounts | None = None) -> RecordedBlocks | None:
         """Compute the blocks for a volume balance with a position, once for each recording; None if it allows none.
@@ -352,8 +379,7 @@ class VolumeBalance:
 
     def learn(self, recording: Recording) -> BalanceSummary | None:
         """Summarise a healthy recording for later comparisons; None if it allows no volume balance."""
-        recorded = self._compute_blocks(recording)
-        balance = self.balance(recording) if recorded is None else self._build_balance(recording, recorded.open)
+        balance, recorded = self._learn_balance(recording)
         if balance is None:
             return None
         summary = BalanceSummary(
@@ -388,7 +414,7 @@ class VolumeBalance:
         counts, as if it were repeated on later days.
         """
         odds = self._learn_odds(summaries, channels)
-        columns = self._columns(channels, Valves.SHUT if odds.valves > 0.0 else Valves.OPEN)
+        columns = self._columns(channels, Valves.SHUT if odds.valves > 0.0 else Valves.OPEN, creeps=odds.creep > 0.0)
         healthy = [_fit_sums(summary, columns) for summary in summaries]
         repetitions = [replace(sums, start_s=_shift_start(sums, k)) for k in range(n_repeats) for sums in healthy]
         flow = float(np.median([summary.flow for summary in summaries]))
@@ -416,10 +442,13 @@ class VolumeBalance:
             log_ratio = (len(with_rests) - 1) * float(np.log(scatter[0] / scatter[1]))
         return MachineOdds.from_healthy(summaries, len(equations(self.rig, channels)), log_ratio)
 
-    def _columns(self, channels: frozenset[str], valves: Valves) -> list[ColumnRoles]:
-        """Return the column roles of each volume balance of channels with a position, for open or shut `valves`."""
+    def _columns(self, channels: frozenset[str], valves: Valves, *, creeps: bool = False) -> list[ColumnRoles]:
+        """Return the column roles of each volume balance of channels with a position, for open or shut `valves`.
+
+        `creeps`: prefer the balance of a load that creeps, if the channels allow it.
+        """
         balances = equations(self.rig, channels)
-        if not balances and (hold_balance := locked(self.rig, channels)) is not None:
+        if (creeps or not balances) and (hold_balance := locked(self.rig, channels)) is not None:
             balances = (hold_balance,)
         return [ColumnRoles(equation if valves is Valves.OPEN else shut_at_rest(equation)) for equation in balances]
 
@@ -454,13 +483,12 @@ class VolumeBalance:
         return replace(report, refusal="the channels of the healthy recordings give another balance of volumes")
 
     def observe_alone(self, recording: Recording, valves: Valves) -> Observed | None:
-        """Report on a recording without a baseline; None without a balance.
+        """Report on a healthy recording without a baseline; None without a balance.
 
         `valves`: those that are assumed if the pump rests in the recording; without rests the report is the same.
         """
-        recorded = self._compute_blocks(recording)
-        if recorded is None:
-            balance = self.balance(recording)  # a balance without a position, or None
+        balance, recorded = self._learn_balance(recording)
+        if recorded is None:  # a balance without a position, or of a load that creeps, or None
             return None if balance is None else self._report(balance, ())
         regime = recorded.regime(-np.inf if valves is Valves.OPEN else np.inf)
         return compute_once(
