@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.estimate.change import Information
+from sealscope.diagnosis.estimate.change import Information, step_test
 from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.inference.equations.terms import LEAK, ORIFICE
 from sealscope.diagnosis.inference.leak_flow import RiseFits, find_leak_step, fit_rise
@@ -131,3 +131,40 @@ def test_blocks_without_a_pressure_give_no_size_that_is_not_a_number() -> None:
     assert np.isfinite([*fits.flow, fits.bound]).all()
     assert fits.flow_within is not None
     assert np.isfinite(fits.flow_within).all()
+
+
+def healthy_draw(pressure: Array, seed: int, walk: float = 0.0) -> tuple[Any, Any, Information]:
+    """Draw blocks of a healthy leak under these pressures (K,), whose conductance wanders by `walk` errors of its mean.
+
+    Returns the blocks, the columns of leak and orifice, and the likelihood of the conductance.
+    """
+    random = np.random.default_rng(seed)
+    unit_flows = np.stack([pressure, pressure**0.5], axis=1)
+    blocks: Any = SimpleNamespace(gram=(unit_flows[:, :, None] * unit_flows[:, None])[:, None])
+    columns: Any = [SimpleNamespace(leak=0, names=(LEAK, ORIFICE))]
+    precision = pressure**2
+    drift = walk * np.cumsum(random.standard_normal(pressure.size)) / np.sqrt(pressure.size * precision.mean())
+    vector = precision * drift + np.sqrt(precision) * random.standard_normal(pressure.size)
+    return blocks, columns, Information(TIME[: pressure.size], np.diag(precision), vector)
+
+
+def test_laws_that_a_constant_pressure_does_not_tell_apart_share_no_false_alarms() -> None:
+    blocks, columns, leak = healthy_draw(np.ones(K), seed=1)
+    leak = leak._replace(vector=leak.vector + leak.precision @ np.where(TIME > ONSET, 1.8, 0.0))  # as of a small leak
+    laminar, joint = step_test(leak), find_leak_step(blocks, columns, leak)
+    assert laminar is not None and joint is not None
+    assert laminar.chance < 0.1
+    assert joint.chance == pytest.approx(laminar.chance, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_the_joint_chance_of_all_laws_is_as_rare_as_it_says() -> None:
+    """Under pressures that differ by a factor of two or more, beside none, some and much drift."""
+    tests = []
+    for seed in range(900):
+        spread, walk = ((0.3, 0.0), (0.7, 3.0), (1.0, 3.0))[seed % 3]
+        pressure = np.exp(spread * np.random.default_rng([seed, 1]).standard_normal(40))
+        tests.append(find_leak_step(*healthy_draw(pressure, seed, walk)))
+    chances = np.array([test.chance for test in tests if test is not None])
+    assert np.mean(chances < 0.01) < 0.02
+    assert np.mean(chances < 0.05) < 0.06

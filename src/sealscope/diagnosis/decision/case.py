@@ -359,8 +359,8 @@ def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
     WITHIN if the other test is AGAINST, or to LEVEL if the other test is WITHIN. The rest goes to the other test.
 
     The p-value (`chance`) of each test is compared with the test's part of the probability. The p-value of a step is
-    `StepTest.chance` (`estimate/change.py`). In the volume balance it was divided by the prior probability of the
-    leak's law (`find_leak_step` of `inference/leak_flow.py`). It is calibrated (`HealthyNull`) by the p-values that the
+    `StepTest.chance` (`estimate/change.py`), in the volume balance the joint one of all laws of a leak
+    (`find_leak_step` of `inference/leak_flow.py`). It is calibrated (`HealthyNull`) by the p-values that the
     same test gave in healthy recordings (`healthy_null` of `detectors/registry.py`). The p-value of a rise is
     `Rise.chance`, which rests on healthy recordings already; that of a level follows from the normal distribution.
     """

@@ -105,10 +105,13 @@ def with_turbulence(leak: Information, blocks: Blocks, columns: Sequence[ColumnR
 def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information) -> StepTest | None:
     """Test for a leak that begins within a recording, with a flow proportional to a power of |p_A - p_B|.
 
-    A step is tested for each exponent of `LAWS`; the p-value of each is divided by the prior probability of the
-    exponent, and the smallest one counts. For an exponent other than 1 the step varies with the pressure, and its size
-    is the mean over the blocks, weighted by their information. `leak`: likelihood of the leak's coefficient in the
-    blocks. Return None if too few blocks determine this coefficient.
+    A step is tested for each exponent of `LAWS`. The joint p-value is the harmonic mean of theirs, P = 1 / sum(w / p),
+    weighted by the prior probabilities w of the exponents: laws that the pressures hardly tell apart share no false
+    alarms. The test with the smallest p / w is returned. For an exponent other than 1 the step varies with the
+    pressure, and its size is the mean over the blocks, weighted by their information. `leak`: likelihood of the leak's
+    coefficient in the blocks. Return None if too few blocks determine this coefficient.
+
+    Source: D. J. Wilson, PNAS 116 (2019) 1195, doi 10.1073/pnas.1814092116.
     """
     weights = np.maximum(leak.precision.sum(axis=0), 0.0)  # information of each block; it may be negative
     shapes = apparent_conductances(blocks, columns)
@@ -117,9 +120,12 @@ def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Informa
         mean_shape = float(weights @ shapes[exponent]) / max(float(weights.sum()), _TINY)
         test = step_test(leak, shape=shapes[exponent] / max(mean_shape, _TINY))
         if test is not None:
-            tests.append(test.share_alarms(prior))
+            tests.append((test, prior))
+    if not tests:
+        return None
     # of equal p-values, such as 1, the highest score counts
-    return min(tests, key=lambda test: (test.chance, -test.score), default=None)
+    best, _ = min(tests, key=lambda pair: (pair[0].chance / pair[1], -pair[0].score))
+    return best.share_alarms(sum(prior * best.chance / max(test.chance, _TINY) for test, prior in tests))
 
 
 def mixture_flow(probabilities: Array, flows: Array, deviations: Array) -> Estimate:
