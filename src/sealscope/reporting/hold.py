@@ -45,7 +45,8 @@ def list_figures(result: HoldResult) -> list[tuple[str, str]]:
             travel = format_estimate(*(number * minutes for number in (creep, *creep_ends))).partition(" ")[0]
             spans.append(f"{travel} mm in {minutes:g} min")
     possible = [" or ".join(result.causes)] if len(result.causes) > 1 else []
-    if result.oil == "not logged" and result.curve is not None:
+    is_known = result.oil.startswith("logged") or result.oil.endswith("steady (stated)")
+    if not is_known and result.curve is not None:
         possible.append("cooling or warming of the oil, which the interval of the leak includes")
     areas = " and ".join(f"{area:.5g}" for area in result.areas_mm2)
     quality = "; ".join(finding.text for finding in result.quality if finding.severity != "note")

@@ -5,10 +5,12 @@ chamber, the oil's relative compression c(p) and its thermal expansion a,
 
     s(t) - (V/A) (c(p(t)) - c(p(0))) = (Q/A) I(t) - a (V/A) (T(t) - T(0)) + what settles + noise,
 
-where I(t) is the time, weighted by the leak's law |p_A - p_B|^e. `regression` estimates Q/A, with an interval; its
-prior is a tight cylinder or a leak of unknown size (`leak_prior`). The creep is the mean speed of s; its bends, by
-compression, the leak's law and oil that cools unlogged, are fitted without the chords between their ends. A temperature
-that was logged or stated is a term of it.
+where I(t) is the time, weighted by the leak's flow |p_A - p_B|^e nu(T)^(1 - 2 e) over its mean: a leak whose pressure
+or viscosity changes is stated by its mean over the hold. `regression` estimates Q/A, with an interval; its prior is a
+tight cylinder or a leak of unknown size (`leak_prior`). The creep is the mean speed of s over the hold; its bends, by
+compression, the leak's law and oil that cools unlogged, are fitted without the chords between their ends. The travel
+by a temperature that was logged or stated is left out of both. A piston at rest on its stop is a hypothesis of its own:
+then the pressure alone tells the leak.
 
 Source: Merritt, Hydraulic Control Systems, 1967, sections 2.2 and 6.3.
 """
@@ -16,15 +18,16 @@ Source: Merritt, Hydraulic Control Systems, 1967, sections 2.2 and 6.3.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
 
 from sealscope.diagnosis.estimate.interval import WITHIN_95
-from sealscope.diagnosis.estimate.population import Mixture, pool_mixtures
+from sealscope.diagnosis.estimate.population import LEAST_WEIGHT, Mixture, pool_mixtures, weigh_alternatives
 from sealscope.diagnosis.hold.readings import (
+    N_PARTS,
     Readings,
     average_parts,
     course_basis,
@@ -38,6 +41,7 @@ from sealscope.diagnosis.hold.regression import (
     RateFit,
     RateRegression,
     leak_prior,
+    log_overlap,
     pool_fits,
 )
 from sealscope.diagnosis.hold.result import HoldCurve
@@ -61,13 +65,12 @@ LAST_PART = 0.97
 SMOOTH_DEGREE = 3
 #: Time constants [durations of the hold] of the exponentials that such a smooth course has as well.
 COURSE_TIMES = (0.06, 0.2)
+#: Number of errors of such a course, the largest first, that are fitted beside it.
+N_SHAPES = 3
 #: Time [s] by which a logged temperature is moved to find its slope.
 DELAY = 1.0
 #: Least driving pressure from which a flow is converted, in deviations of the zero of the sensors.
 LEAST_DRIVE = 0.2
-#: Factor by which the travel equivalent to a pressure's change exceeds a piston's travel, where that is at a stop: of a
-#: travel that may be none, and of one that the noise does not explain.
-AT_STOP, SURELY_AT_STOP = 3.0, 30.0
 #: Error of a rounded temperature at a passage, and of its change over a hold without passages, in steps.
 PASSED, ROUNDED = 0.15, 0.4
 #: Standard deviation of the logarithm of a time constant within a step of its grid, and a step of a derivative by it.
@@ -79,17 +82,19 @@ _MM = 1e3
 
 
 class LeakClock(NamedTuple):
-    """Time weighted by the flow of a leak under one law: prior `weight`, `minutes` (m,) of mean `flow` (m,) 1.
+    """Time weighted by the flow of a leak under one law, over its mean: prior `weight`, `minutes` (m,).
 
-    `zero` (m,): its change by a standard deviation of the sensors' zeros, None for a steady flow;
-    `conversions`: probability, factor to the flow at the reference pressure, and deviation of its logarithm.
+    `laminar`: power by which the flow goes with the inverse of the viscosity; `errors`: changes (m,) of the minutes by
+    a standard deviation of the sensors' zeros, and of the oil's viscosity; `conversions`: probability, factor to the
+    flow at the reference pressure, and deviation of its logarithm; `belief`: power of the evidence for the law.
     """
 
     weight: float
     minutes: Array
-    flow: Array
-    zero: Array | None = None
+    laminar: float
+    errors: tuple[Array, ...] = ()
     conversions: tuple[tuple[float, float, float], ...] = ()
+    belief: float = 1.0
 
     def convert(self, rate: Mixture) -> Mixture | None:
         """Convert a rate to the reference pressure; None without one."""
@@ -98,6 +103,27 @@ class LeakClock(NamedTuple):
         shares = np.array([share for share, _, _ in self.conversions])
         rates = [rate.scale(factor, deviation).condense() for _, factor, deviation in self.conversions]
         return pool_mixtures(rates, shares / shares.sum()).condense()
+
+
+class TemperatureCourse(NamedTuple):
+    """Smooth course of a logged temperature over a hold of a `span` [s], about its level.
+
+    `coefficients` (k,) [K] of a `course_basis`, their `covariance` (k, k) by what the readings leave open, and the
+    `error` [K] of the change from the start of the hold to its end.
+    """
+
+    span: float
+    coefficients: Array
+    covariance: Array
+    error: float
+
+    def basis(self, t: Array) -> Array:
+        """Compute the courses (m, k) at times `t` (m,) [s] of which the temperature is a sum."""
+        return course_basis(t / self.span, SMOOTH_DEGREE, COURSE_TIMES)
+
+    def warmth(self, t: Array) -> Array:
+        """Compute the temperature (m,) [K] at times `t` (m,) [s], less its level."""
+        return np.asarray(self.basis(t) @ self.coefficients)
 
 
 class LeakEstimate(NamedTuple):
@@ -127,14 +153,24 @@ def _compress_zero(p: Array) -> Array:
     return np.asarray(high - low - (high[0] - low[0]))
 
 
-def _exponential(readings: Readings, time: float, size: float, mean: float = 0.0) -> tuple[Column, Column]:
+def _exponential(
+    readings: Readings, time: float, size: float, mean: float = 0.0, thinning: float = 0.0, duration: float = 1.0
+) -> tuple[Column, Column]:
     """Build the columns of an exponential with an amplitude of the given `mean` and deviation `size`.
 
     The second column is its derivative by the logarithm of the time constant, which the grid of these leaves open.
+    `thinning` [1/s]: effect on a leak, whose speed changes by so much for a change of 1 in the exponential; that on its
+    mean speed over the `duration` [s] of the hold is left out.
     """
-    slope = (readings.decay(SLIGHTLY * time) - readings.decay(time / SLIGHTLY)) / (2.0 * math.log(SLIGHTLY))
-    course = Column(readings.decay(time) - 1.0, mean, size)
-    return course, Column(slope, 0.0, math.hypot(size, mean) * GRID_DEVIATION)
+
+    def course(time: float) -> Array:
+        """Compute the exponential from 0, with what the leak adds that it thins or thickens."""
+        decay = readings.decay(time)
+        mean_decay = -time * math.expm1(-duration / time) / duration
+        return decay - 1.0 + thinning * (time * (1.0 - decay) - mean_decay * readings.t)
+
+    slope = (course(SLIGHTLY * time) - course(time / SLIGHTLY)) / (2.0 * math.log(SLIGHTLY))
+    return Column(course(time), mean, size), Column(slope, 0.0, math.hypot(size, mean) * GRID_DEVIATION)
 
 
 class HeldLoad:
@@ -205,13 +241,14 @@ class HeldLoad:
     @property
     def mean_pressure(self) -> float | None:
         """Mean gauge pressure of the loaded side [Pa]; None if it is not recorded."""
-        p = self._channel(f"p_{self.loaded}")
-        return None if p is None else float(np.mean(p))
+        p, collected = self._channel(f"p_{self.loaded}"), self.set_up.collected
+        return float(np.mean(p)) if p is not None else collected and collected[2]
 
     def _settling(self, readings: Readings, sizes: Sequence[float]) -> list[Alternative]:
         """List what may settle in `readings` after the valve has shut; `sizes`: deviations of its amplitude."""
         prior = HOLD.settling
-        times = [time for time in prior.times if time <= prior.longest * self.duration]
+        least = prior.shortest * readings.step * readings.n_samples  # over within the first reading
+        times = [time for time in prior.times if least <= time <= prior.longest * self.duration]
         weight = prior.present / max(len(times) * len(sizes), 1)
         terms = [_exponential(readings, time, size) for time in times for size in sizes]
         return [Alternative(1.0 - prior.present), *(Alternative(weight, term) for term in terms)]
@@ -237,48 +274,56 @@ class HeldLoad:
         return [Alternative(1.0 - prior.present), *(Alternative(weight, columns) for columns in bends)]
 
     @cached_property
-    def logged_temperature(self) -> Readings | None:
-        """Readings of the oil's temperature; None if less than half of it was logged."""
+    def temperature(self) -> TemperatureCourse | None:
+        """Course of the oil's temperature; None if less than half of it was logged."""
         T = self._channel("T_oil")
         if T is None or np.isfinite(T).mean() < 0.5:
             return None
-        return read_channel(self.t[np.isfinite(T)], T[np.isfinite(T)], HOLD.cooling.step)
+        t, T = self.t[np.isfinite(T)], T[np.isfinite(T)]
+        logged = read_channel(t, T, HOLD.cooling.step)
+        course = TemperatureCourse(self.duration, np.zeros(0), np.zeros((0, 0)), 0.0)
+        basis, change = course.basis(logged.t), np.diff(course.basis(np.array([0.0, self.duration])), axis=0)[0]
+        errors = np.hypot(logged.loose, max(PASSED * logged.quantum, 1e-3))
+        values = (logged.values - float(logged.values.mean())) / errors
+        weighted = basis / errors[:, None]
+        size = float(np.ptp(logged.values)) + (logged.quantum or estimate_quantum(T) or HOLD.cooling.step)
+        deviations = size * np.array([*HOLD.cooling.shapes, *np.full(len(COURSE_TIMES), HOLD.cooling.shapes[0])])
+        covariance = np.linalg.inv(weighted.T @ weighted + np.diag([0.0, *deviations**-2.0]))
+        coefficients = covariance @ (weighted.T @ values)
+        covariance = np.asarray(covariance) * max(float(np.mean((values - weighted @ coefficients) ** 2)), 1.0)
+        error = math.sqrt(float(change @ covariance @ change))
+        if not logged.quantum:  # means of rounded values
+            error = math.hypot(error, ROUNDED * estimate_quantum(T))
+        return course._replace(coefficients=coefficients, covariance=covariance, error=error)
 
     def _thermal_columns(self, t: Array, length: float, deviation: float) -> list[Column]:
         """Build the columns [mm] of a logged temperature at times `t`, for a column of oil of a `length`; or none.
 
         They are its effect, known to a relative `deviation` beside that of the oil's expansion, that of the
-        thermometer's delay, and a line for what the log does not tell of the change.
+        thermometer's delay, a line for what the log does not tell of the change, and errors of the course's shape.
         """
-        T, logged, prior = self._channel("T_oil"), self.logged_temperature, HOLD.cooling
-        if T is None or logged is None:
+        course, prior = self.temperature, HOLD.cooling
+        if course is None:
             return []
-        errors = np.hypot(logged.loose, max(PASSED * logged.quantum, 1e-3))
-        times = np.concatenate([t, t + DELAY, [0.0, self.duration], logged.t]) / self.duration
-        basis = course_basis(times, SMOOTH_DEGREE, COURSE_TIMES)
-        now, later, ends, read = np.split(basis, np.cumsum([len(t), len(t), 2]))
-        weighted = read / errors[:, None]
-        ridge = np.diag([0.0, *np.full(basis.shape[1] - 1, max(prior.sizes) ** -2.0)])
-        covariance = np.linalg.inv(weighted.T @ weighted + ridge)
-        middle = float(logged.values.mean())
-        coefficients = covariance @ (weighted.T @ ((logged.values - middle) / errors))
-        residual = (logged.values - middle - read @ coefficients) / errors
-        change = ends[1] - ends[0]
-        error = math.sqrt(float(change @ covariance @ change) * max(float(np.mean(residual**2)), 1.0))
-        if not logged.quantum:  # means of rounded values
-            error = math.hypot(error, ROUNDED * estimate_quantum(T))
         scale = -prior.expansion * length
-        travel, delayed = scale * ((now - ends[0]) @ coefficients), scale * ((later - now) @ coefficients) / DELAY
-        unread = math.hypot(scale * error, prior.misfit * float(np.ptp(travel)))
+        warmth = course.warmth(t)
+        travel, delayed = scale * (warmth - course.warmth(np.zeros(1))), scale * (course.warmth(t + DELAY) - warmth)
+        unread = math.hypot(scale * course.error, prior.misfit * float(np.ptp(travel)))
+        # shapes vanish at both ends of the hold, whose difference has an error of its own
+        first, last = course.basis(np.array([0.0, self.duration]))
+        bends = course.basis(t) - first - (t / self.duration)[:, None] * (last - first)
+        shapes, sizes, _ = np.linalg.svd(bends @ np.linalg.cholesky(course.covariance), full_matrices=False)
         return [
             Column(travel, 1.0, math.hypot(deviation, prior.expansion_deviation)),
-            Column(delayed, *prior.lag),
+            Column(delayed / DELAY, *prior.lag),
             Column(t / self.duration, 0.0, unread),
+            *(Column(scale * shape, 0.0, 1.0) for shape in (shapes * sizes)[:, :N_SHAPES].T),
         ]
 
-    def _cooling(self, readings: Readings, length: float, deviation: float) -> list[Alternative]:
+    def _cooling(self, readings: Readings, length: float, deviation: float, viscous: float = 0.0) -> list[Alternative]:
         """List the alternatives for the travel [mm] due to the oil's temperature in `readings` (`_thermal_columns`).
 
+        `viscous` [mm/min]: speed by a leak, times the power by which that goes with the inverse of the viscosity.
         Where no pressure is logged, the other side may be locked: the travel by a logged temperature then has either
         sign.
         """
@@ -295,17 +340,33 @@ class HeldLoad:
             excess = max(prior.sizes)
             if set_up.oil_temperature is not None and set_up.oil_course == "falling":
                 excess = max(set_up.oil_temperature - prior.ambient, min(prior.sizes))
-            mean, deviation = prior.stated
-            sizes = [((1.0 if set_up.oil_course == "falling" else -1.0) * mean * excess, deviation * excess)]
+            mean, share = prior.stated
+            mean *= excess if set_up.oil_course == "falling" else -excess
+            sizes = [(mean, share * excess), (mean, share * max(prior.sizes))]  # some workshops are colder
         factor = prior.expansion * length
-        weight = 1.0 / (len(sizes) * len(prior.times))
-        terms = [_exponential(readings, time, factor * d, -factor * mean) for time in prior.times for mean, d in sizes]
-        return [Alternative(weight, term) for term in terms]
+        thinning = -viscous / 60.0 * INFERENCE.oil.per_kelvin / factor
+        return [
+            Alternative(
+                weight / len(sizes),
+                _exponential(readings, time, factor * d, -factor * mean, thinning, self.duration),
+            )
+            for time, weight in zip(prior.times, self._weigh_cooling_times(), strict=True)
+            for mean, d in sizes
+        ]
+
+    def _weigh_cooling_times(self) -> list[float]:
+        """Weigh the times in which oil cools by the bore of the cylinder; equal weights if that is unknown."""
+        prior, area = HOLD.cooling, self.set_up.area("A")
+        logs = np.zeros(len(prior.times))
+        if area is not None:
+            usual, spread = prior.bore
+            logs = -0.5 * (np.log(np.array(prior.times) / (usual * math.sqrt(4.0 * area / math.pi))) / spread) ** 2
+        return [float(weight) for weight in weigh_alternatives(logs)]
 
     @property
     def warming(self) -> float:
         """Standard deviation [K] of a change of the oil's temperature that is neither logged nor stated to be small."""
-        if self.logged_temperature is not None:
+        if self.temperature is not None:
             return 0.0
         return HOLD.cooling.steady if self.set_up.oil_course == "steady" else max(HOLD.cooling.sizes)
 
@@ -313,28 +374,59 @@ class HeldLoad:
     def thermal_error(self) -> float:
         """Standard deviation [mm] of the travel over the hold by what a logged temperature does not tell."""
         logged = self._thermal_columns(self.t, *self.column)
-        return logged[-1].deviation if logged else 0.0
+        return logged[2].deviation if logged else 0.0
 
-    def _clocks(self, readings: Readings) -> list[LeakClock]:
-        """List the clocks of the laws of a leak, as `readings` see them."""
-        p, other = self._pressure(self.loaded), self._pressure(self.unloaded)
-        steady = LeakClock(1.0, readings.t / 60.0, np.ones_like(readings.t))
-        if p is None:
-            return [steady]
-        # past the piston, or out of the cylinder
-        differences = [self._implied_difference(p) if other is None else p - other, p - P_ATM]
-        courses = [smooth_course(self.t, difference) for difference in differences]
-        if all(course.max() < STEADY_PRESSURE * course.min() for _, course in courses):
-            steadily = [self._convert(course, *law) for _, course in courses for law in LAWS.items()]
-            return [steady._replace(conversions=tuple(filter(None, steadily)))]
+    def _clocks(self, readings: Readings, driven: bool = True) -> list[LeakClock]:
+        """List the clocks of the laws of a leak, as `readings` see them: by its driving pressure and its viscosity.
+
+        A flow of the power e of the pressure goes with the power 1 - 2 e of the viscosity: no other combination of
+        flow, gap, density, viscosity and pressure has a unit of 1. `driven`: by a pressure that is logged, too.
+        """
+        p, other = (self._pressure(side) if driven else None for side in (self.loaded, self.unloaded))
+        oil = INFERENCE.oil
+        t, courses, warmth = np.zeros(1), [], np.zeros(1)
+        if not self.t.size:
+            courses = [] if self.mean_pressure is None else [np.array([self.mean_pressure])]
+        elif p is not None:  # past the piston, or out of the cylinder
+            differences = [self._implied_difference(p) if other is None else p - other, p - P_ATM]
+            (t, first), (_, second) = (smooth_course(self.t, difference) for difference in differences)
+            courses = [first, second]
+        else:
+            t, _ = average_parts(self.t, self.t, N_PARTS)
+        if self.temperature is not None:
+            warmth = self.temperature.warmth(t) - float(np.mean(self.temperature.warmth(t)))
+        is_steady = all(course.max() < STEADY_PRESSURE * course.min() for course in courses)
+        ratios = [course / np.where(courses[0] > 0.0, courses[0], np.nan) for course in courses]
+        is_alike = all(ratio.max() < STEADY_PRESSURE * ratio.min() for ratio in ratios)
+        groups = [courses] if is_steady or is_alike else [[course] for course in courses]
+        zero = (
+            0.0
+            if is_steady or p is None
+            else math.hypot(HOLD.other.offset * BAR, INFERENCE.held_oil.gain * float(np.mean(p)))
+        )
         clocks = []
-        for part_t, course in courses:
-            zero = math.hypot(HOLD.other.offset * BAR, INFERENCE.held_oil.gain * float(np.mean(p)))
-            for exponent, weight in LAWS.items():
-                minutes, flow = self._weigh_time(readings, part_t, course, exponent)
-                high, low = (self._weigh_time(readings, part_t, course + d, exponent)[0] for d in (zero, -zero))
-                conversions = tuple(filter(None, [self._convert(course, exponent, 1.0)]))
-                clocks.append(LeakClock(weight / len(differences), minutes, flow, 0.5 * (high - low), conversions))
+        for group in groups:
+            for exponent, weight in reversed(LAWS.items()):
+                laminar = 2.0 * exponent - 1.0
+
+                def weigh(offset: float, slope: float) -> Array:
+                    """Weigh the time by the flow at an `offset` of the pressure [Pa] and a `slope` of the viscosity."""
+                    drive = np.ones(len(t)) if is_steady else group[0] + offset  # noqa: B023
+                    flow = np.sign(drive) * np.abs(drive) ** exponent * np.exp(laminar * slope * warmth)  # noqa: B023
+                    return self._weigh_time(readings, t, flow)
+
+                k, d = oil.per_kelvin, oil.per_kelvin_deviation
+                errors = [0.5 * (weigh(zero, k) - weigh(-zero, k))] if zero else []
+                errors += [0.5 * (weigh(0.0, k + d) - weigh(0.0, k - d))] if laminar * float(np.ptp(warmth)) else []
+                conversions = (self._convert(course, exponent, weight) for course in group)
+                clocks.append(
+                    LeakClock(
+                        weight / len(groups), weigh(0.0, k), laminar, tuple(errors), tuple(filter(None, conversions))
+                    )
+                )
+        if is_steady and oil.per_kelvin * float(np.ptp(warmth)) < math.log(STEADY_PRESSURE):
+            steadily = tuple(entry for clock in clocks for entry in clock.conversions)
+            return [LeakClock(1.0, readings.t / 60.0, 0.0, (), steadily)]
         return clocks
 
     def _implied_difference(self, p: Array) -> Array:
@@ -344,7 +436,7 @@ class HeldLoad:
         equalised the sides at the end.
         """
         area, other_area = self.set_up.area(self.loaded), self.set_up.area(self.unloaded)
-        if self.travel is None or self._is_at_stop or area is None or other_area is None:
+        if self.travel is None or area is None or other_area is None:
             return p - float(np.mean(p[self.t >= self.duration * LAST_PART]))
         start = float(np.mean(p[self.t <= self.duration * (1.0 - LAST_PART)]))
         return start - P_ATM - (area / other_area - 1.0) * (p - start)
@@ -360,36 +452,45 @@ class HeldLoad:
         mean = max(float(np.mean(np.abs(driving) ** exponent)) ** (1.0 / exponent), LEAST_DRIVE * offset)
         return weight, (reference / mean) ** exponent, exponent * offset / mean
 
-    def _weigh_time(self, readings: Readings, t: Array, difference: Array, exponent: float) -> tuple[Array, Array]:
-        """Compute times [min] of `readings` weighted by a power of a pressure `difference` at `t`, and the weights.
-
-        Their mean is 1.
-        """
-        flow = np.sign(difference) * np.abs(difference) ** exponent
+    def _weigh_time(self, readings: Readings, t: Array, flow: Array) -> Array:
+        """Compute times [min] of `readings` weighted by a `flow` at times `t` over its mean."""
         steps = 0.5 * (flow[1:] + flow[:-1]) * np.diff(t)
         volume = flow[0] * t[0] + np.concatenate([[0.0], np.cumsum(steps)])
         total = float(volume[-1] + flow[-1] * (self.duration - t[-1]))
-        scale = self.duration / (total or 1.0)
-        return sample_course(readings, t, volume) * (scale / 60.0), sample_course(readings, t, flow) * scale
+        return sample_course(readings, t, volume) * (self.duration / (total or 1.0) / 60.0)
 
     @cached_property
     def creep(self) -> RateFit | None:
         """Speed at which the piston sinks [mm/min], with what settles fitted; None without a position."""
         if self.travel is None:
             return None
-        readings, stopped = self._travel_readings, HOLD.settling.stopped
-        base = [Column(readings.t / 60.0), Column(np.ones_like(readings.t))]
-        thermal = self._cooling(readings, *self.column) if self.set_up.oil_course or self.logged_temperature else []
-        resting = [Alternative(stopped if thermal else 1.0)]  # a piston on its stop follows no temperature
-        thermal = [entry._replace(weight=(1.0 - stopped) * entry.weight) for entry in thermal]
+        readings, (_, at_rest, logs) = self._travel_readings, self._motion
         alternatives = [self._settling(readings, self._strain_sizes(self.column[0])), self._bends(readings)]
-        fits = [self._regression.fit_rate(base, [*alternatives, terms]) for terms in (thermal, resting) if terms]
-        logs = [fit.log_evidence for fit in fits]
-        if thermal:  # ... and does not creep
-            logs[1] -= 0.5 * (fits[1].rate.mean / fits[1].rate.deviation) ** 2
-        fit = pool_fits(fits, logs)
+        if self.set_up.oil_course or self.temperature:
+            alternatives.append(self._cooling(readings, *self.column))
+        base = [Column(np.ones_like(readings.t))]
+        sinking = self._fit_laws(self._regression, base, alternatives, self._clocks(readings, driven=False))
+        fit = pool_fits([sinking, at_rest], logs)
         bend = fit.fit - np.linspace(fit.fit[0], fit.fit[-1], len(fit.fit))
         return fit._replace(rate=fit.rate.add_error(HOLD.cooling.misfit * float(np.ptp(bend)) / (self.duration / 60.0)))
+
+    @cached_property
+    def _motion(self) -> tuple[RateFit, RateFit, tuple[float, float]]:
+        """Fits of the travel for a piston that a leak lets sink, and for one at rest on its stop; log probabilities.
+
+        At rest it follows neither pressure nor temperature.
+        """
+        readings, level = self._travel_readings, Column(np.ones_like(self._travel_readings.t))
+        sinking = self._fit_leak(self._regression, [level, *self._column_terms()], 0.0)
+        at_rest = self._regression.fit_rate(
+            [Column(readings.t / 60.0), level], [self._settling(readings, self._strain_sizes(self.column[0]))]
+        )
+        still, stopped = Mixture(np.ones(1), np.array([HOLD.settling.rest]), np.zeros(1)), HOLD.settling.stopped
+        logs = (
+            math.log(1.0 - stopped) + sinking.log_evidence + log_overlap(sinking.rate, leak_prior()),
+            math.log(stopped) + at_rest.log_evidence + log_overlap(at_rest.rate, still),
+        )
+        return sinking, at_rest._replace(rate=still), logs
 
     def _column_terms(self) -> list[Column]:
         """Build the columns of the travel [mm] by compression of the loaded side's oil and air, and by its length.
@@ -434,6 +535,13 @@ class HeldLoad:
         zero = Column(length * _compress_zero(readings.values), 0.0, 1.0)
         return readings, travel, [Column(np.ones_like(readings.t)), zero]
 
+    @property
+    def is_closed(self) -> bool:
+        """True if the side without the load is closed, as stated, or by a pressure above that of a tank line."""
+        p = self._channel(f"p_{self.unloaded}")
+        is_raised = p is not None and float(np.median(p)) > HOLD.other.tank * BAR
+        return self.unloaded in self.set_up.capped or is_raised
+
     @cached_property
     def gain(self) -> Mixture | None:
         """Rate [mm/min] at which the other side is compressed, as travel of its own area; None without its pressure."""
@@ -448,7 +556,9 @@ class HeldLoad:
             Alternative(entry.weight, tuple(column._replace(values=-column.values) for column in entry.columns))
             for entry in self._cooling(compression, _MM * length, width)
         ]
-        thermal = [Alternative(0.5), *(Alternative(0.5 * weight, columns) for weight, columns in closed)]
+        thermal = closed
+        if not self.is_closed:
+            thermal = [Alternative(0.5), *(Alternative(0.5 * weight, columns) for weight, columns in closed)]
         settling = self._settling(compression, self._strain_sizes(_MM * length))
         alternatives = [settling, self._bends(compression), thermal]
         clocks = [clock._replace(conversions=()) for clock in self._clocks(compression)[: len(LAWS)]]
@@ -460,32 +570,34 @@ class HeldLoad:
         """Leak of the hold, by the best of its sources: collected oil, a flow meter, position, pressure."""
         set_up, area = self.set_up, self.set_up.area(self.loaded)
         if set_up.collected is not None:
-            volume, time = set_up.collected
+            volume, time, _ = set_up.collected
             prior = HOLD.collected
             deviation = math.hypot(prior.deviation * volume, prior.drop * 1e-6) / time
-            flow = Mixture(np.ones(1), np.array([deviation]), np.array([volume / time]))
+            metered = Mixture(np.ones(1), np.array([deviation]), np.array([volume / time]))
         elif (meter := self._channel("q_leak")) is not None:
-            flow = self._metered_flow(meter)
+            metered = self._metered_flow(meter)
         else:
-            leak = (
-                self._leak_by_travel() if self.travel is not None and not self._is_at_stop else self._leak_by_pressure()
-            )
-            if leak.rate is None:
-                return leak
-            rate = leak.rate.multiply(leak_prior())
+            leaks, weights = self._leaks()
+            if not leaks:
+                return LeakEstimate(None, None)
+
+            def pool(estimates: list[Mixture | None]) -> Mixture | None:
+                """Pool the estimates of all leaks; None if there are none."""
+                known = [estimate for estimate in estimates if estimate is not None]
+                return pool_mixtures(known, weights).condense() if known else None
+
+            best, rate = leaks[int(np.argmax(weights))], pool([entry.rate for entry in leaks])
             if area is None:
-                return leak._replace(rate=rate, converted=None)
-            scale = MM_PER_MINUTE * area
-            flow, *converted = (
-                self._widen(estimate).multiply(leak_prior()).scale(scale)
-                for estimate in (leak.rate, leak.converted)
-                if estimate is not None
-            )
-            return leak._replace(rate=rate, flow=flow, converted=converted[0] if converted else None)
-        clocks = self._clocks(Readings(np.zeros(1), np.zeros(1), np.zeros(1), 0.0)) if self.t.size else []
-        at_clocks = [entry for clock in clocks if (entry := clock.convert(flow)) is not None]
+                return best._replace(rate=rate, flow=None, converted=None)
+            flows = pool([entry.flow for entry in leaks]), pool([entry.converted for entry in leaks])
+            flow, converted = (estimate and estimate.scale(MM_PER_MINUTE * area) for estimate in flows)
+            return best._replace(rate=rate, flow=flow, converted=converted)
+        clocks = self._clocks(Readings(np.zeros(1), np.zeros(1), np.zeros(1), 0.0))
+        at_clocks = [entry for clock in clocks if (entry := clock.convert(metered)) is not None]
         at_reference = pool_mixtures(at_clocks, np.array([clock.weight for clock in clocks])) if at_clocks else None
-        return LeakEstimate(None if area is None else flow.scale(1.0 / (MM_PER_MINUTE * area)), flow, at_reference)
+        return LeakEstimate(
+            None if area is None else metered.scale(1.0 / (MM_PER_MINUTE * area)), metered, at_reference
+        )
 
     def _widen(self, rate: Mixture) -> Mixture:
         """Add the errors by which a flow over the area differs from the `rate` [mm/min] of a piston.
@@ -503,57 +615,79 @@ class HeldLoad:
         return pool_mixtures([free, held], np.array([1.0 - HOLD.other.locked, HOLD.other.locked])).condense()
 
     def _metered_flow(self, meter: Array) -> Mixture:
-        """Estimate the mean flow [m^3/s] of a leakage flow meter, whose gain is uncertain, under each law of a leak."""
-        readings = read_channel(self.t, meter, ML_PER_MINUTE)
-        scale = float(np.abs(readings.values).max()) or ML_PER_MINUTE
-        scaled = readings._replace(
-            values=readings.values / scale, loose=readings.loose / scale, quantum=readings.quantum / scale
+        """Estimate the mean flow [m^3/s] of a leakage flow meter: the speed of a piston that its oil would move.
+
+        A leak flows from the higher pressure to the lower, whichever way the meter was mounted.
+        """
+        step, scale = estimate_quantum(meter) or ML_PER_MINUTE, float(np.abs(meter).max()) or ML_PER_MINUTE
+        minutes = np.diff(self.t, prepend=self.t[0]) / 60.0
+        volume = np.cumsum(minutes * 0.5 * (meter + np.concatenate([meter[:1], meter[:-1]]))) / scale
+        mean_t, means = average_parts(self.t, volume, HOLD.noise.nodes)
+        n_samples = len(self.t) / len(means)
+        readings = Readings(
+            mean_t, means, np.zeros(len(means)), 0.0, self.duration / max(len(self.t) - 1, 1), n_samples
         )
-        regression = RateRegression(scaled, self.duration, from_first=False)
-        settling, clocks = self._settling(readings, (0.1, 1.0)), self._clocks(readings)
-        fits = [regression.fit_rate([Column(clock.flow)], [settling]) for clock in clocks]
-        logs = [math.log(clock.weight) + fit.log_evidence for clock, fit in zip(clocks, fits, strict=True)]
-        fit = pool_fits(fits, logs)
-        return fit.rate.scale(scale).add_error(INFERENCE.size.meter * abs(fit.rate.mean) * scale)
+        settling = self._settling(readings, [share * float(np.ptp(volume)) or 1.0 for share in HOLD.meter.settling])
+        fit = self._fit_laws(
+            RateRegression(readings, self.duration),
+            [Column(np.ones_like(mean_t))],
+            [settling, self._bends(readings)],
+            self._clocks(readings),
+        )
+        flow = fit.rate.scale(math.copysign(scale, fit.rate.mean))
+        return flow.add_error(math.hypot(INFERENCE.size.meter * flow.mean, 12.0**-0.5 * step))
 
-    def _leak_by_travel(self) -> LeakEstimate:
-        """Estimate the leak from the travel, corrected for the compression of the loaded chamber's oil."""
-        readings = self._travel_readings
-        base = [Column(np.ones_like(readings.t)), *self._column_terms()]
-        fit = self._fit_leak(self._regression, base, 0.0)
-        return LeakEstimate(fit.rate, None, fit.converted, self._make_curve("x", "mm", readings, fit, 1.0), fit)
+    def _leaks(self) -> tuple[list[LeakEstimate], Array]:
+        """Estimate the leak of a piston that sinks, and of one at rest on its stop, with their probabilities.
 
-    def _leak_by_pressure(self) -> LeakEstimate:
-        """Estimate the leak from the fall of the pressure of a chamber whose piston stands still."""
-        p = self._pressure(self.loaded)
-        if p is None:
-            return LeakEstimate(None, None)
+        The former is known from a position alone, the latter from a pressure. Flows are over the area, as the rates.
+        """
+        p, prior = self._pressure(self.loaded), leak_prior()
+        if self.travel is not None:
+            fit, _, logs = self._motion
+            curve, converted = self._make_curve("x", "mm", self._travel_readings, fit, 1.0), fit.converted
+            rate, flow = fit.rate.multiply(prior), self._widen(fit.rate).multiply(prior)
+            widened = None if converted is None else self._widen(converted).multiply(prior)
+            leaks = [LeakEstimate(rate, flow, widened, curve, fit)]
+            if p is not None and logs[1] - logs[0] > math.log(LEAST_WEIGHT):
+                leaks.append(self._leak_by_pressure(p)[0])
+        elif p is not None:
+            at_rest, logs = self._leak_by_pressure(p)
+            leaks = [LeakEstimate(prior, prior, at_rest.converted and prior, at_rest.curve, at_rest.fit), at_rest]
+        else:
+            return [], np.zeros(0)
+        return leaks, weigh_alternatives(np.array(logs[: len(leaks)]))
+
+    def _leak_by_pressure(self, p: Array) -> tuple[LeakEstimate, tuple[float, float]]:
+        """Estimate the leak from the fall of the pressure `p` of a chamber whose piston stands still.
+
+        Returns also the log probabilities that the piston sinks instead, at a pressure that friction alone lets vary,
+        and that it rests.
+        """
         length, deviation = self.column
         pressures, compression, base = self._read_compression(p, -length)
         fit = self._fit_leak(RateRegression(compression, self.duration), base, INFERENCE.held_oil.deviation)
         width = math.hypot(deviation, INFERENCE.held_oil.deviation)
         rate, converted = fit.rate.scale(1.0, width).condense(), fit.converted
         if converted is not None:
-            converted = converted.scale(1.0, width).condense()
-        if self.creep is not None:
-            rate = rate.add_error(self.creep.rate.deviation)
+            converted = converted.scale(1.0, width).condense().multiply(leak_prior())
+        size = HOLD.load.steady * INFERENCE.held_oil.compressibility * BAR * length / (self.duration / 60.0)
+        steady = Mixture(np.ones(1), np.array([size]), np.zeros(1))
+        alternatives = [self._settling(compression, self._strain_sizes(length)), self._bends(compression)]
+        sinking = RateRegression(compression, self.duration).fit_rate(
+            [Column(compression.t / 60.0), *base], alternatives
+        )
+        logs = (
+            math.log(HOLD.load.sinking) + sinking.log_evidence + log_overlap(sinking.rate, steady),
+            math.log(1.0 - HOLD.load.sinking) + fit.log_evidence + log_overlap(rate, leak_prior()),
+        )
+        rate = rate.multiply(leak_prior())
         # the fit is drawn as a pressure, by the slope of the compression over the hold
         travelled, fallen = np.ptp(compression.values), np.ptp(pressures.values) / BAR
         in_bar = pressures._replace(values=(pressures.values - P_ATM) / BAR)
         slope = -float(fallen / travelled) if travelled > 0.0 else 0.0
-        return LeakEstimate(rate, None, converted, self._make_curve(f"p_{self.loaded}", "bar", in_bar, fit, slope), fit)
-
-    @cached_property
-    def _is_at_stop(self) -> bool:
-        """True if the piston stands still while the loaded chamber's pressure changes."""
-        p = self._pressure(self.loaded)
-        if p is None or self.creep is None:
-            return False
-        _, compression = average_parts(self.t, _compress_oil(p).sum(axis=0), 10)
-        low, high = self.creep.rate.interval
-        travel = abs(self.creep.rate.mean) * self.duration / 60.0
-        factor = AT_STOP if low <= 0.0 <= high else SURELY_AT_STOP
-        return float(np.ptp(compression)) * self.column[0] > factor * travel
+        curve = self._make_curve(f"p_{self.loaded}", "bar", in_bar, fit, slope)
+        return LeakEstimate(rate, rate, converted, curve, fit), logs
 
     def _fit_laws(
         self,
@@ -561,15 +695,23 @@ class HeldLoad:
         base: Sequence[Column],
         alternatives: Sequence[Sequence[Alternative]],
         clocks: Sequence[LeakClock],
+        cooling: Callable[[float], list[Alternative]] | None = None,
     ) -> RateFit:
-        """Fit the rate [mm/min] under each law of a leak (`clocks`), and pool the laws."""
+        """Fit the rate [mm/min] under each law of a leak (`clocks`), and pool the laws.
+
+        `cooling`: lists the alternatives of the oil's temperature by the speed [mm/min] that follows the viscosity
+        (`_cooling`), which for each law is estimated by the one before it.
+        """
         fits, logs = [], []
         speed = float(np.ptp(regression.readings.values)) / (self.duration / 60.0)
+        viscous = 0.0  # the first law is that of an orifice
         for clock in clocks:
-            law = [] if clock.zero is None else [Column(speed * clock.zero, 0.0, 1.0)]
-            fits.append(regression.fit_rate([Column(clock.minutes), *base, *law], alternatives))
+            law = [Column(speed * error, 0.0, 1.0) for error in clock.errors]
+            thermal = [cooling(clock.laminar * viscous)] if cooling else []
+            fits.append(regression.fit_rate([Column(clock.minutes), *base, *law], [*alternatives, *thermal]))
+            viscous = fits[-1].rate.multiply(leak_prior()).mean
             fits[-1] = fits[-1]._replace(converted=clock.convert(fits[-1].rate))
-            logs.append(math.log(clock.weight) + fits[-1].log_evidence)
+            logs.append(math.log(clock.weight) + clock.belief * fits[-1].log_evidence)
         return pool_fits(fits, logs)
 
     def _fit_leak(self, regression: RateRegression, base: Sequence[Column], deviation: float) -> RateFit:
@@ -579,11 +721,16 @@ class HeldLoad:
         """
         readings = regression.readings
         length, _ = self.column
-        settling = self._settling(readings, self._strain_sizes(length))
-        alternatives = [settling, self._bends(readings), self._cooling(readings, length, deviation)]
-        fit = self._fit_laws(regression, base, alternatives, self._clocks(readings))
+        alternatives = [self._settling(readings, self._strain_sizes(length)), self._bends(readings)]
+        clocks = self._clocks(readings)
+        if len(clocks) == 1 and self.warming > HOLD.cooling.steady:  # at a steady pressure the laws differ by viscosity
+            share = sum((2.0 * exponent - 1.0) * weight for exponent, weight in LAWS.items())
+            laws = (0.0, 1.0 - share), (1.0, share)
+            clocks = [clocks[0]._replace(weight=weight, laminar=power, belief=0.0) for power, weight in laws]
+        cooling = partial(self._cooling, readings, length, deviation)
+        fit = self._fit_laws(regression, base, alternatives, clocks, cooling)
         # oil that cools unlogged follows an exponential but for a share, which is as straight as a leak
-        misfit = 0.0 if self.logged_temperature else HOLD.cooling.misfit * float(np.ptp(fit.last))
+        misfit = 0.0 if self.temperature else HOLD.cooling.misfit * float(np.ptp(fit.last))
         return fit._replace(rate=fit.rate.add_error(misfit / (self.duration / 60.0)))
 
     def _make_curve(self, channel: str, unit: str, readings: Readings, fit: RateFit, factor: float) -> HoldCurve:

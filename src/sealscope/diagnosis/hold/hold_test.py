@@ -7,6 +7,7 @@ It needs no motion, no pump and no healthy recordings. `readings` finds the hold
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Sequence
 from itertools import compress
 
@@ -16,6 +17,7 @@ from threadpoolctl import threadpool_limits
 from sealscope.calls import checked_call
 from sealscope.diagnosis.hold.hold_equation import HeldLoad
 from sealscope.diagnosis.hold.judgement import judge_hold
+from sealscope.diagnosis.hold.limits import parse_in_range
 from sealscope.diagnosis.hold.readings import find_held_parts
 from sealscope.diagnosis.hold.result import HoldResult
 from sealscope.diagnosis.hold.set_up import SetUp, parse_set_up
@@ -27,9 +29,9 @@ from sealscope.recordings.header import start_seconds
 from sealscope.recordings.motion import is_constant
 from sealscope.recordings.quality import Finding, inspect
 from sealscope.recordings.recording import Array, Recording
-from sealscope.units import BAR
+from sealscope.units import BAR, ML_PER_MINUTE, MM_PER_MINUTE, same_dimension
 
-_UNLOADED = "a rest without a load across the piston is no hold, and is not judged"
+_REST = "a short rest, or one with little load across the piston, is no hold of the test: --from and --until judge it"
 
 
 @checked_call
@@ -116,8 +118,12 @@ def hold_test(
     if moment is None and (start_s := start_seconds(recording, name)) is not None:
         moment = np.datetime64(round(start_s - float(samples.t[0])), "s")  # of t = 0
     date = None if moment is None else str(moment)
+    for column in recording.unused:
+        if (unit := re.search(r"[\[(]([^\])]+)[\])]\s*$", column)) and same_dimension(unit[1], "m^3/s"):
+            text = f"{column} is not read: if it is the leakage flow, then --map 'q_leak={column}'"
+            findings.append(Finding("unused_flow", "warning", None, len(recording), None, text))
     parts, rests = _cut_holds(samples, set_up)
-    findings += [] if not rests else [Finding("unloaded_rest", "note", None, len(rests), rests[0], _UNLOADED)]
+    findings += [] if not rests else [Finding("unloaded_rest", "note", None, len(rests), rests[0], _REST)]
     with threadpool_limits(limits=1):  # faster for small matrices, and the results do not depend on the machine
         return tuple(judge_hold(HeldLoad(part, set_up, name, findings, date)) for part in parts)
 
@@ -164,6 +170,8 @@ def _select_samples(recording: Recording) -> Recording:
             unit = {"x": "mm", "q_leak": "mL/min"}.get(name, "bar")
             raise InputError(f"{name} must have a unit, got raw counts: state it, as in --map '{name}=COLUMN[{unit}]'")
     values = {name: recording[name] for name in names}
+    if "x" in values:
+        parse_in_range(float(np.nanmax(np.abs(values["x"]), initial=0.0)), "m", "position")
     names = [name for name in names if np.count_nonzero(np.isfinite(values[name])) > 0.5 * len(recording)]
     if not names:
         unused = f"; unused: {join_names(recording.unused)}" if recording.unused else ""
@@ -181,16 +189,18 @@ def _select_samples(recording: Recording) -> Recording:
 def _cut_holds(samples: Recording, set_up: SetUp) -> tuple[list[Recording], list[float]]:
     """Cut the holds out of a log, or out of the part whose start or end is stated; with both, this part is the hold.
 
-    Returns them, and the starts [s] of rests without a load across the piston (`_find_load`), which are none. Raises
-    InputError if no hold is left.
+    Returns them, and the starts [s] of rests, which are none: without a load across the piston (`_find_load`), or of
+    far less load over time than the longest hold, as before the lift and after the release. Raises InputError if no
+    hold is left.
     """
     extent, shortest = f"in a log of {len(samples)} samples over {samples.duration:.3g} s", HOLD.part.shortest
     low, high = (-np.inf if set_up.start is None else set_up.start), (np.inf if set_up.end is None else set_up.end)
     samples = samples._select((samples.t >= low) & (samples.t <= high), "stated part")
-    t, x, pressures = samples.t, samples.channels.get("x"), [samples[name] for name in CHAMBERS if name in samples]
+    t, x, flow = samples.t, samples.channels.get("x"), samples.channels.get("q_leak")
+    pressures = [samples[name] for name in CHAMBERS if name in samples]
     parts = [(0, len(t) - 1)] if len(t) else []
     if parts and (x is not None or pressures) and None in (set_up.start, set_up.end):
-        parts = find_held_parts(t, x, pressures) if len(t) > 2 else []
+        parts = find_held_parts(t, x, pressures, flow) if len(t) > 2 else []
         extent = f"without motion {extent}"
     durations = [float(t[last] - t[first]) for first, last in parts]
     held = [part for part, duration in zip(parts, durations, strict=True) if duration >= shortest]
@@ -198,16 +208,25 @@ def _cut_holds(samples: Recording, set_up: SetUp) -> tuple[list[Recording], list
     if not held:
         longest = f"{max(durations):.3g} s at most" if durations else "none"
         raise InputError(f"a hold must last {shortest:g} s with 5 samples or more, got {longest} {extent}")
-    load, tank = _find_load(pressures), HOLD.other.tank * BAR
+    if x is not None:
+        speeds = [abs(float(x[last] - x[first]) / float(t[last] - t[first])) / MM_PER_MINUTE for first, last in held]
+        held = [part for part, speed in zip(held, speeds, strict=True) if speed < HOLD.part.motion]
+        if not held:
+            got = f"{min(speeds):.3g} mm/min {extent}: the cylinder moves"
+            raise InputError(f"a held load sinks by {HOLD.part.motion:g} mm/min at most, got {got}")
+    load, tank, loads = _find_load(pressures), HOLD.other.tank * BAR, np.ones(len(held))
     # beside a position, a single chamber may be the one without the load
-    if load is None or (len(pressures) == 1 and x is not None and float(load.mean()) < tank):
-        return [samples.samples(slice(first, last + 1)) for first, last in held], []
-    loads = [float(load[first : last + 1].mean()) for first, last in held]
-    if max(loads) < tank:
-        sides = " across the piston" if len(pressures) > 1 else ""
-        got = f"{max(loads) / BAR:.2g} bar {extent}"
-        raise InputError(f"a hold needs a load of {tank / BAR:g} bar or more{sides}, got {got}")
-    is_loaded = [held_load >= tank for held_load in loads]
+    if load is not None and not (len(pressures) == 1 and x is not None and float(load.mean()) < tank):
+        loads = np.array([float(load[first : last + 1].mean()) for first, last in held])
+        if loads.max() < tank:
+            sides = " across the piston" if len(pressures) > 1 else ""
+            got = f"{loads.max() / BAR:.2g} bar {extent}"
+            raise InputError(f"a hold needs a load of {tank / BAR:g} bar or more{sides}, got {got}")
+        loads *= loads >= tank
+    if flow is not None:
+        loads *= [max(float(np.abs(flow[first : last + 1]).mean()), ML_PER_MINUTE * 1e-6) for first, last in held]
+    loads *= [float(t[last] - t[first]) for first, last in held]
+    is_loaded = loads >= HOLD.part.rest * loads.max()
     holds = [samples.samples(slice(first, last + 1)) for first, last in compress(held, is_loaded)]
     return holds, [float(t[first]) for (first, _), loaded in zip(held, is_loaded, strict=True) if not loaded]
 

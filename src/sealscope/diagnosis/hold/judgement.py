@@ -43,11 +43,14 @@ def judge_hold(hold: HeldLoad) -> HoldResult:
         compared, interval, scale = leak.flow, flow_ends, 1.0
         if limit.pressure is not None:
             compared, interval = converted, converted_ends
+    shown, shown_ends = (leak.rate, rate_ends) if leak.flow is None else (leak.flow, flow_ends)
     bound = None if limit is None else limit.value / scale
     result = None
     if bound is not None:
         result = "undecided" if interval is None else decide_result(interval, bound)
-    shown, shown_ends = (leak.rate, rate_ends) if leak.flow is None else (leak.flow, flow_ends)
+        is_fed = shown_ends is not None and shown_ends[1] < 0.0  # a leak into the chamber is a leak
+        if is_fed and interval is not None and interval[0] < -bound:
+            result = "undecided"
     has_leak = shown_ends is not None and shown_ends[0] > 0.0
     if shown is not None and hold.warming > HOLD.cooling.steady:  # the prior of cooling is an assumption
         has_leak &= shown.below(0.0) < HOLD.other.sure
@@ -80,7 +83,7 @@ def judge_hold(hold: HeldLoad) -> HoldResult:
         causes=causes,
         second_test=_second_test(hold, causes),
         minutes_needed=minutes,
-        reason=_describe(hold, result, causes, minutes, compared is None and limit is not None),
+        reason=_describe(hold, result, causes, minutes, _name_lack(hold) if bound and compared is None else ""),
         start=hold.start,
         areas_mm2=tuple(1e6 * area for area in set_up.areas),
         oil=describe_oil(hold),
@@ -123,20 +126,19 @@ def _weigh_piston(hold: HeldLoad) -> int:
         return 0
     low, high = gain.interval
     prior, is_material = HOLD.other, abs(gain.mean) > HOLD.other.material * abs(leak.rate.mean)
-    p = hold.recording[f"p_{hold.unloaded}"] if hold.recording is not None else np.zeros(1)
-    is_shut = hold.unloaded in hold.set_up.capped
-    is_closed = is_shut or float(np.median(p)) > prior.tank * BAR
-    if is_closed and is_material and low > 0.0:
+    if hold.is_closed and is_material and low > 0.0:
         return 1
     area, other_area = hold.set_up.area(hold.loaded), hold.set_up.area(hold.unloaded)
     ratio = 1.0 if area is None or other_area is None else other_area / area
     travel = Mixture(np.ones(1), np.zeros(1), np.zeros(1)) if hold.creep is None else hold.creep.rate
     gained = ratio * (travel.mean + gain.mean)
-    error = ratio * math.hypot(travel.deviation, gain.deviation)
+    # oil of that side that may cool unlogged
+    kelvin = min(HOLD.cooling.sizes) if hold.warming > HOLD.cooling.steady else 0.0
+    cooled = 1e3 * hold.set_up.column(hold.unloaded, None)[0] * HOLD.cooling.expansion * kelvin / (hold.duration / 60.0)
+    highest = gained + WITHIN_95 * ratio * math.hypot(travel.deviation, gain.deviation, cooled)
     falls = is_material and high < 0.0
-    if (is_shut or falls) and gained + WITHIN_95 * error < leak.rate.interval[0]:
-        return -1
-    return 0
+    is_shut = hold.unloaded in hold.set_up.capped or falls
+    return -1 if is_shut and highest < prior.minor * leak.rate.interval[0] else 0
 
 
 def _second_test(hold: HeldLoad, causes: Sequence[str]) -> str:
@@ -190,10 +192,15 @@ def format_estimate(value: float, low: float, high: float) -> str:
     return f"{value:.{decimals}f} ({low:.{decimals}f} to {high:.{decimals}f})"
 
 
-def _describe(
-    hold: HeldLoad, result: str | None, causes: Sequence[str], minutes: float | None, lacks_area: bool
-) -> str:
-    """Describe the result of a hold in a sentence or two."""
+def _name_lack(hold: HeldLoad) -> str:
+    """Name what a limit cannot be compared without: the pressure held, to convert a flow, or the area."""
+    if hold.leak.flow is not None and hold.set_up.limit is not None and hold.set_up.limit.kind == "flow":
+        return "the pressure that was held" + (" ('... at 200 bar')" if hold.set_up.collected else "")
+    return "the piston's area (--area)"
+
+
+def _describe(hold: HeldLoad, result: str | None, causes: Sequence[str], minutes: float | None, lack: str) -> str:
+    """Describe the result of a hold in a sentence or two; `lack`: what the limit needs that is not known, or ""."""
     parts, leak = [], hold.leak
     place = "" if hold.mean_pressure is None else f" at {hold.mean_pressure / BAR:.3g} bar"
     if hold.creep is not None:
@@ -206,20 +213,22 @@ def _describe(
         mean, (low, high) = leak.flow.mean / ML_PER_MINUTE, (end / ML_PER_MINUTE for end in leak.flow.interval)
         if low > 0.0:
             words = f"leak {format_estimate(mean, low, high)} mL/min"
+        elif high < 0.0:
+            words = f"oil enters, {format_estimate(-mean, -high, -low)} mL/min: past the piston, a valve, or it warms"
         else:
-            words = f"no leak above {max(high, 0.0):.2g} mL/min"
-        stop = ", the piston taken to rest on its stop" if leak.fit is not None else ""
+            words = f"no leak above {high:.2g} mL/min"
+        stop = ", if the piston rests on its stop: log its position" if leak.fit is not None else ""
         parts.append(words + ("" if hold.creep is not None else place + stop))
     text = "; ".join(parts) or "neither creep nor leak can be estimated"
-    if lacks_area:
-        text += "; the limit needs the piston's area (--area)"
+    if lack:
+        text += f"; the limit needs {lack}"
     advice = ["log the oil's temperature"] if hold.warming else []
     advice += [] if minutes is None else [f"hold for {minutes:.0f} min more"]
     if COOLING in causes and hold.creep is not None:
         length, _ = hold.column
         kelvin = hold.creep.rate.mean * hold.duration / 60.0 / (HOLD.cooling.expansion * length)
         text += f"; cooling by {kelvin:.2g} K would do the same{': ' if advice else ''}{', or '.join(advice)}"
-    elif result == "undecided" and not lacks_area:
+    elif result == "undecided" and not lack:
         text += f"; too close to the limit{f': hold for {minutes:.0f} min more' if minutes is not None else ''}"
     elif causes:
         text += f"; {' or '.join(causes) if len(causes) < 3 else join_names(causes[:-1]) + ' or ' + causes[-1]}"

@@ -12,10 +12,14 @@ from sealscope.units import BAR, ML_PER_MINUTE, MM_PER_MINUTE, from_si, parse_qu
 Result = Literal["pass", "fail", "undecided"]
 #: An amount in a time, as in `24 mm in 3 min` or `12 mL/10 min`.
 _AMOUNT = r"(?P<amount>.+?)(?:(?:\s+in\s+|\s*/\s*)(?P<time>\d.*?))"
+_PRESSURE = r"(?:\s+at\s+(?P<pressure>.+?))?\s*"
 #: The parts of a limit: name, amount, time and pressure, as in `boom: 24 mm in 3 min at 200 bar`.
-_LIMIT = re.compile(rf"(?:(?P<name>[^:]+):)?\s*{_AMOUNT}?(?:\s+at\s+(?P<pressure>.+?))?\s*", re.IGNORECASE)
+_LIMIT = re.compile(rf"(?:(?P<name>[^:]+):)?\s*{_AMOUNT}?{_PRESSURE}", re.IGNORECASE)
 #: Least and largest of what is stated, in the unit of messages, by its SI unit: rods of 4 mm to bores of 1.1 m.
-RANGES = {"m^2": (1e-5, 1.0, "m^2"), "m^3": (1e-6, 1.0, "m^3"), "Pa": (1.0, 5000.0, "bar"), "K": (-60.0, 200.0, "degC")}
+RANGES = {
+    **{"m^2": (1e-5, 1.0, "m^2"), "m^3": (1e-6, 1.0, "m^3"), "m": (0.0, 1e5, "mm")},
+    **{"Pa": (1.0, 5000.0, "bar"), "K": (-60.0, 200.0, "degC")},
+}
 _EXAMPLES = "'24 mm in 3 min', '15 mL/min' or 'NAME: 0.3 mL/min at 200 bar'"
 
 
@@ -90,15 +94,19 @@ def parse_duration(text: str, name: str) -> float:
     return seconds
 
 
-def parse_collected(text: str) -> tuple[float, float]:
-    """Parse a collected volume such as "12 mL in 10 min" to m^3 and s; raise InputError for another text."""
-    match = re.fullmatch(_AMOUNT, text) if isinstance(text, str) else None
+def parse_collected(text: str) -> tuple[float, float, float | None]:
+    """Parse a collected volume such as "12 mL in 10 min at 200 bar" to m^3, s and, None if not stated, Pa.
+
+    Raises InputError for another text.
+    """
+    match = re.fullmatch(rf"{_AMOUNT}{_PRESSURE}", text, re.IGNORECASE) if isinstance(text, str) else None
     if match is None:
-        raise InputError(f"collected must be a volume in a time, such as '12 mL in 10 min', got {text!r}")
+        raise InputError(f"collected must be a volume in a time, such as '12 mL in 10 min at 200 bar', got {text!r}")
     amount = parse_quantity(match["amount"], "m^3", name="collected")
     if amount < 0.0:
         raise InputError(f"collected must be a volume of 0 or more, got {text}")
-    return amount, parse_duration(match["time"], "collected")
+    pressure = None if match["pressure"] is None else parse_in_range(match["pressure"], "Pa", "pressure of collected")
+    return amount, parse_duration(match["time"], "collected"), pressure
 
 
 def decide_result(interval: tuple[float, float], limit: float) -> Result:

@@ -161,10 +161,13 @@ def smooth_course(t: Array, values: Array) -> tuple[Array, Array]:
     return part_t, means
 
 
-def find_held_parts(t: Array, x: Array | None, pressures: Sequence[Array] = ()) -> list[tuple[int, int]]:
+def find_held_parts(
+    t: Array, x: Array | None, pressures: Sequence[Array] = (), flow: Array | None = None
+) -> list[tuple[int, int]]:
     """Find the holds of a log: first and last index of the samples between which neither position nor pressure moves.
 
-    `t` [s], `x` [m], `pressures` [Pa] (n,): samples without gaps, of which some may be absent. What moves differs from
+    `t` [s], `x` [m], `pressures` [Pa], leakage `flow` [m^3/s] (n,): samples without gaps, of which some may be absent.
+    A flow begins and ends with the hold. What moves differs from
     the hold about it: means over `part.bin` of `priors.toml` change `part.ratio` times as fast as the slowest quarter
     of them, within `part.creep` and `part.speed`, or faster than `part.decay` of the highest pressure and
     `part.pressure`; and together they move by more than slips and settling do (`part.travel`, `part.fall`).
@@ -173,12 +176,14 @@ def find_held_parts(t: Array, x: Array | None, pressures: Sequence[Array] = ()) 
     step = float(np.median(np.diff(t)))
     n_bins = int(min(max((t[-1] - t[0]) / max(prior.bin, step), 1.0), MAX_BINS))
     held = max((float(np.quantile(p, HIGHEST)) for p in pressures), default=0.0)  # a leak may empty the chamber
+    usual = 0.0 if flow is None else float(np.quantile(np.abs(flow), HIGHEST))
     decay = min(prior.pressure * BAR, prior.decay * held) if held > 0.0 else prior.pressure * BAR
     speeds, decays = (prior.creep * 1e-3, prior.speed * 1e-3), (decay, decay)
     is_moving, bin_t = np.zeros(0, dtype=bool), t
     limits = (
         *([] if x is None else [(x, speeds, prior.position * 1e-3, prior.travel * 1e-3)]),
         *((p, decays, prior.scatter * BAR, prior.fall * held) for p in pressures),
+        *([] if flow is None else [(flow, (prior.decay * usual, prior.decay * usual), math.inf, prior.fall * usual)]),
     )
     for values, (slowest, fastest), largest, travel in limits:
         bin_t, means = average_parts(t, values, n_bins)

@@ -32,7 +32,7 @@ from sealscope.recordings.recording import Array
 VARIANCE_POINTS = np.arange(-2.0, 6.0)
 #: Iterations that find the most probable variance, and the decrease of the log likelihood from the best beyond which a
 #: combination is left out after them; in two stages.
-STAGES = (1, 60.0), (3, 14.0)
+STAGES = (1, 30.0), (3, 10.0)
 #: Smallest standard deviation of the noise of a mean, in the readings' unit, and over their range: no model is exact.
 LEAST_DEVIATION, LEAST_SHARE = 1e-6, 3e-4
 #: Ridge on the diagonal of the relative covariance of the noise.
@@ -96,6 +96,14 @@ def leak_prior() -> Mixture:
     return Mixture(weights, np.array([prior.rate, *(0.5 * leaks), *lifts]), np.array([0.0, *leaks, *(0.0 * lifts)]))
 
 
+def log_overlap(rate: Mixture, prior: Mixture) -> float:
+    """Compute the log evidence of a `rate`, of a fit without a prior of its own, under a `prior`."""
+    totals = np.hypot(rate.deviations[:, None], prior.deviations)
+    logs = -0.5 * ((rate.centres[:, None] - prior.centres) / totals) ** 2 - np.log(totals)
+    largest = float(logs.max())
+    return largest + math.log(float(rate.weights @ np.exp(logs - largest) @ prior.weights))
+
+
 class RateFit(NamedTuple):
     """Posterior of the rate, the first coefficient, and the most probable fit of the readings."""
 
@@ -115,7 +123,7 @@ def pool_fits(fits: Sequence[RateFit], logs: Sequence[float]) -> RateFit:
     weights /= weights.sum()
     rate = pool_mixtures([fit.rate for fit in fits], weights).condense()
     converted = [fit.converted for fit in fits if fit.converted is not None]
-    pooled = pool_mixtures(converted, weights).condense() if converted else None
+    pooled = pool_mixtures(converted, weights).condense() if len(converted) == len(fits) else None
     return fits[int(weights.argmax())]._replace(rate=rate, converted=pooled)
 
 
@@ -171,11 +179,11 @@ class RateRegression:
             precision[:, ::-1].copy(),
             mean[:, ::-1].copy(),
         )
-        scratch = np.empty((choices.shape[1] + 1, choices.shape[1]))
+        work = np.empty((choices.shape[1], choices.shape[1] + 1))
         for n_iterations, decrease in STAGES:
             solution = np.empty((len(rows), 3))
             n = 0 if quantum else n_iterations
-            _solve_rates(*system, rows, variance, freedom, least, n, scratch, solution)
+            _solve_rates(*system, rows, variance, freedom, least, n, work, solution)
             profile = prior[rows] - 0.5 * (m * np.log(variance) + solution[:, 0])
             is_probable = profile > profile.max() - decrease
             rows, variance = rows[is_probable], variance[is_probable]
@@ -186,7 +194,7 @@ class RateRegression:
             grid = np.maximum(np.exp(spread * VARIANCE_POINTS)[:, None] * grid, least).ravel()
             rows = np.tile(rows, len(VARIANCE_POINTS))
         solution = np.empty((len(rows), 3))
-        _solve_rates(*system, rows, grid, freedom, least, 0, scratch, solution)
+        _solve_rates(*system, rows, grid, freedom, least, 0, work, solution)
         logs = prior[rows] - 0.5 * (m * np.log(grid) + solution[:, 0]) + log_step
         weights = np.exp(logs - logs.max())
         best = int(weights.argmax())
@@ -231,7 +239,7 @@ def _solve_rates(
     freedom: float,
     least: float,
     n_iterations: int,
-    scratch: Any,
+    work: Any,
     solution: Any,
 ) -> None:
     """Solve the normal equations of k combinations of noise and columns, and write `solution` (k, 3).
@@ -240,38 +248,38 @@ def _solve_rates(
     `mean` (c, p): columns of a combination and priors of their coefficients, that of the rate the last; `rows` (k,):
     noise times c, plus combination; `variances` (k,): of the noise, replaced in `n_iterations` by the most probable,
     `least` or more. Written are the misfit with the log determinant of the matrix, and the rate's deviation and mean.
-    `scratch` (p + 1, p) is working memory.
+    `work` (p, p + 1) is working memory: rows of the upper triangular factor, with the right side.
     """
     n_choices, p = choices.shape
-    factor, right = scratch, scratch[p]
     for k in range(len(rows)):
         noise, choice = divmod(rows[k], n_choices)
-        products = gram[noise]
+        products, columns = gram[noise], choices[choice]
         for iteration in range(n_iterations + 1):
-            variance = variances[k]
-            misfit, log_det = products[0, 0] / variance, 0.0
+            weight, log_det, scale = 1.0 / variances[k], 0.0, 0.0
+            misfit = products[0, 0] * weight
             for i in range(p):
-                column = choices[choice, i]
-                weight = precision[choice, i]
-                right_value = products[column, 0] / variance + weight * mean[choice, i]
-                misfit += weight * mean[choice, i] ** 2
-                for j in range(i + 1):
-                    value = products[column, choices[choice, j]] / variance
-                    if i == j:
-                        value += weight
-                    for m in range(j):
-                        value -= factor[i, m] * factor[j, m]
-                    factor[i, j] = math.sqrt(max(value, LEAST_PIVOT)) if i == j else value / factor[j, j]
-                for m in range(i):
-                    right_value -= factor[i, m] * right[m]
-                right[i] = right_value / factor[i, i]
-                misfit -= right[i] ** 2
-                log_det += 2.0 * math.log(factor[i, i])
+                for j in range(i, p):
+                    work[i, j] = products[columns[i], columns[j]] * weight
+                expected = precision[choice, i] * mean[choice, i]
+                work[i, i] += precision[choice, i]
+                work[i, p] = products[columns[i], 0] * weight + expected
+                misfit += expected * mean[choice, i]
+            for i in range(p):
+                pivot = max(work[i, i], LEAST_PIVOT)
+                log_det += math.log(pivot)
+                scale = 1.0 / math.sqrt(pivot)
+                for j in range(i, p + 1):
+                    work[i, j] *= scale
+                for m in range(i + 1, p):
+                    factor = work[i, m]
+                    for j in range(m, p + 1):
+                        work[m, j] -= factor * work[i, j]
+                misfit -= work[i, p] ** 2
             if iteration < n_iterations:
-                variances[k] = max(variance * max(misfit, RIDGE) / freedom, least)
+                variances[k] = max(variances[k] * max(misfit, RIDGE) / freedom, least)
         solution[k, 0] = misfit + log_det
-        solution[k, 1] = 1.0 / factor[p - 1, p - 1]
-        solution[k, 2] = right[p - 1] / factor[p - 1, p - 1]
+        solution[k, 1] = scale
+        solution[k, 2] = work[p - 1, p] * scale
 
 
 def _list_choices(alternatives: Sequence[Sequence[Alternative]], n_base: int) -> tuple[NDArray[np.intp], Array]:

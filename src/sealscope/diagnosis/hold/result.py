@@ -45,11 +45,13 @@ class HoldResult:
     start_s, end_s : float or None
         Times of the hold.
     creep_mm_per_min, creep_interval_mm_per_min : float or None, tuple or None
-        Mean speed at which the piston sinks, positive towards the loaded chamber, without what settles when valves
-        shut. A travel due to a temperature that is logged or stated is left out, one of oil that nobody logs is not.
+        Mean speed over the hold at which the piston sinks, positive towards the loaded chamber, without what settles
+        when valves shut. A travel due to a temperature that is logged or stated is left out, one of oil that nobody
+        logs is not.
     leak_lpm, leak_interval_lpm : float or None, tuple or None
-        Flow out of the loaded chamber [L/min], corrected for compression and temperature; that of a tight cylinder is
-        a hypothesis of its own (`[tight]` of `priors.toml`).
+        Mean flow out of the loaded chamber over the hold [L/min], corrected for compression and temperature, as it
+        changes with pressure and viscosity; that of a tight cylinder is a hypothesis of its own (`[tight]` of
+        `priors.toml`).
     pressure_bar : float or None
         Mean pressure of the loaded chamber.
     leak_at_lpm, leak_at_interval_lpm, at_bar : float or None, tuple or None, float or None

@@ -9,8 +9,8 @@ from sealscope.diagnosis.priors.hold import HOLD
 from sealscope.errors import InputError
 from sealscope.units import parse_quantity
 
-#: Courses of a temperature that is not logged.
-COURSES = ("falling", "rising", "steady")
+#: Courses of a temperature that is not logged, by the words that state them.
+COURSES = {"falling": "falling", "cooling": "falling", "rising": "rising", "warming": "rising", "steady": "steady"}
 
 
 class SetUp(NamedTuple):
@@ -18,7 +18,8 @@ class SetUp(NamedTuple):
 
     `areas`, `volumes`: of one side, or of A and B; `valves`: sides with a load-holding valve, None if not stated;
     `capped`: sides whose port is capped; `reference`: pressure [Pa] to which the leak is converted; `oil_temperature`
-    [degC], `oil_course`: of oil that is not logged; `collected`: volume [m^3] and time [s]; `loaded`: side, or "";
+    [degC], `oil_course`: of oil that is not logged; `collected`: volume [m^3], time [s] and pressure [Pa] or None;
+    `loaded`: side, or "";
     `start`, `end` [s]: times of the hold, None to find them.
     """
 
@@ -30,7 +31,7 @@ class SetUp(NamedTuple):
     reference: float | None
     oil_temperature: float | None
     oil_course: str
-    collected: tuple[float, float] | None
+    collected: tuple[float, float, float | None] | None
     loaded: str
     start: float | None
     end: float | None
@@ -114,8 +115,12 @@ def _parse_oil(text: str | None) -> tuple[float | None, str]:
     if text is None:
         return None, ""
     words = text.split()
-    course = words.pop().lower() if words and words[-1].lower() in COURSES else ""
-    temperature = " ".join(words)
-    if not (course if not words else any(map(str.isdigit, temperature))):
-        raise InputError(f"oil must be such as '45 degC falling', 'rising' or 'steady', got {text!r}")
-    return (parse_in_range(temperature, "K", "oil") - 273.15 if words else None), course
+    course = COURSES.get(words[-1].lower(), "") if words else ""
+    temperature = " ".join(words[:-1] if course else words)
+    if not temperature and course:
+        return None, course
+    try:
+        kelvin = parse_quantity(temperature, "K", name="oil")
+    except InputError:
+        raise InputError(f"oil must be such as '45 degC falling', 'rising' or 'steady', got {text!r}") from None
+    return parse_in_range(kelvin, "K", "oil") - 273.15, course

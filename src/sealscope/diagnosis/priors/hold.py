@@ -7,6 +7,7 @@ class HeldPart(PriorTable):
     """The part of a log in which a load is held."""
 
     speed: float  # [mm/s] largest speed of a held piston
+    motion: float  # [mm/min] largest mean speed of a held piston
     creep: float  # [mm/s] speed below which every piston is held
     ratio: float  # speed of a motion, over that of the slower parts of a log
     travel: float  # [mm] largest slip of a held piston, or its settling
@@ -17,6 +18,7 @@ class HeldPart(PriorTable):
     position: float  # [mm] largest noise of a position
     scatter: float  # [bar] largest noise of a pressure
     shortest: float  # [s] shortest hold
+    rest: float  # smallest load times duration of a hold, over the largest
     share: float  # smallest held share of a recording of a held load
     motor: float  # [rad/s] largest speed of a motor at rest
     bin: float  # [s] time over which samples are averaged to find holds
@@ -27,8 +29,10 @@ class SettlingPriors(PriorTable):
 
     present: float  # probability that something settles within the hold
     times: tuple[float, ...]  # [s] time constants
+    shortest: float  # [times between readings] shortest of them
     longest: float  # [durations of the hold] longest of them
-    stopped: float  # probability that oil that cools does not bend the travel, as of a piston at its stop
+    stopped: float  # probability that the piston rests on its stop
+    rest: float  # [mm/min] standard deviation of its creep
     strain: tuple[float, ...]  # standard deviations of the amplitude of the oil's relative compression
 
 
@@ -45,8 +49,10 @@ class CoolingPriors(PriorTable):
 
     times: tuple[float, ...]  # [s] time constants
     sizes: tuple[float, ...]  # [K] standard deviations of the whole change
+    bore: tuple[float, float]  # [s/m] usual time over the bore, and deviation of its logarithm
     stated: tuple[float, float]  # mean and standard deviation of the change of stated oil, over its excess
     ambient: float  # [degC] temperature that stated oil approaches
+    shapes: tuple[float, float, float]  # polynomials of a temperature's course, over its range
     step: float  # [K] step of a constant temperature
     lag: tuple[float, float]  # [s] mean and standard deviation of a thermometer's delay
     misfit: float  # share of the effect of a logged temperature that its column leaves
@@ -96,6 +102,7 @@ class OtherSide(PriorTable):
     sure: float  # largest chance of no leak of one that is named, where the oil is not logged
     locked: float  # probability that a side whose pressure is not logged is locked
     offset: float  # [bar] standard deviation of the zero of a pressure
+    minor: float  # largest gain of the other side over the leak, where the piston is not named
     material: float  # least gain of the side over the leak
     tank: float  # [bar] largest pressure of a side that may be open to the tank
 
@@ -106,7 +113,15 @@ class LoadPriors(PriorTable):
     gauge: float  # relative error of area and position
     friction: float  # [bar] variation of a free load's pressure that is not logged
     change: float  # [bar] the same above a locked side
+    sinking: float  # probability that a piston sinks whose position is not logged
+    steady: float  # [bar] change of the pressure of a load that sinks
     stiffness: float  # relative compression above a locked side or a spring
+
+
+class MeterPriors(PriorTable):
+    """A leakage flow meter."""
+
+    settling: tuple[float, ...]  # standard deviations of what settles, over the volume of the hold
 
 
 class CollectedOil(PriorTable):
@@ -128,6 +143,7 @@ class HeldLoadPriors(PriorTable):
     noise: NoisePriors
     other: OtherSide
     load: LoadPriors
+    meter: MeterPriors
     collected: CollectedOil
 
 
