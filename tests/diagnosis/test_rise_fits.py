@@ -145,7 +145,7 @@ def healthy_draw(pressure: Array, seed: int, walk: float = 0.0) -> tuple[Any, An
     precision = pressure**2
     drift = walk * np.cumsum(random.standard_normal(pressure.size)) / np.sqrt(pressure.size * precision.mean())
     vector = precision * drift + np.sqrt(precision) * random.standard_normal(pressure.size)
-    return blocks, columns, Information(TIME[: pressure.size], np.diag(precision), vector)
+    return blocks, columns, Information(BLOCK_S * (np.arange(pressure.size) + 0.5), np.diag(precision), vector)
 
 
 def test_laws_that_a_constant_pressure_does_not_tell_apart_share_no_false_alarms() -> None:
@@ -155,6 +155,15 @@ def test_laws_that_a_constant_pressure_does_not_tell_apart_share_no_false_alarms
     assert laminar is not None and joint is not None
     assert laminar.chance < 0.1
     assert joint.chance == pytest.approx(laminar.chance, rel=1e-6)
+
+
+def test_a_leak_whose_chance_is_too_small_for_a_float_is_found_all_the_same() -> None:
+    blocks, columns, leak = healthy_draw(np.ones(1200), seed=1)
+    leak = leak._replace(vector=leak.vector + leak.precision @ np.where(leak.time > leak.time.mean(), 100.0, 0.0))
+    joint = find_leak_step(blocks, columns, leak)
+    assert joint is not None
+    assert joint.chance == 0.0
+    assert joint.threshold(0.01) < joint.score
 
 
 @pytest.mark.slow

@@ -404,26 +404,16 @@ class HeldLoad:
             if is_steady or p is None
             else math.hypot(HOLD.other.offset * BAR, INFERENCE.held_oil.gain * float(np.mean(p)))
         )
-        clocks = []
+        clocks, k, d = [], oil.per_kelvin, oil.per_kelvin_deviation
         for group in groups:
             for exponent, weight in reversed(LAWS.items()):
                 laminar = 2.0 * exponent - 1.0
-
-                def weigh(offset: float, slope: float) -> Array:
-                    """Weigh the time by the flow at an `offset` of the pressure [Pa] and a `slope` of the viscosity."""
-                    drive = np.ones(len(t)) if is_steady else group[0] + offset  # noqa: B023
-                    flow = np.sign(drive) * np.abs(drive) ** exponent * np.exp(laminar * slope * warmth)  # noqa: B023
-                    return self._weigh_time(readings, t, flow)
-
-                k, d = oil.per_kelvin, oil.per_kelvin_deviation
-                errors = [0.5 * (weigh(zero, k) - weigh(-zero, k))] if zero else []
-                errors += [0.5 * (weigh(0.0, k + d) - weigh(0.0, k - d))] if laminar * float(np.ptp(warmth)) else []
-                conversions = (self._convert(course, exponent, weight) for course in group)
-                clocks.append(
-                    LeakClock(
-                        weight / len(groups), weigh(0.0, k), laminar, tuple(errors), tuple(filter(None, conversions))
-                    )
-                )
+                drive = np.ones(len(t)) if is_steady else group[0]
+                run = partial(self._weigh_by_law, readings, t, warmth, exponent)
+                errors = [0.5 * (run(drive + zero, k) - run(drive - zero, k))] if zero else []
+                errors += [0.5 * (run(drive, k + d) - run(drive, k - d))] if laminar * float(np.ptp(warmth)) else []
+                conversions = tuple(filter(None, (self._convert(course, exponent, weight) for course in group)))
+                clocks.append(LeakClock(weight / len(groups), run(drive, k), laminar, tuple(errors), conversions))
         if is_steady and oil.per_kelvin * float(np.ptp(warmth)) < math.log(STEADY_PRESSURE):
             steadily = tuple(entry for clock in clocks for entry in clock.conversions)
             return [LeakClock(1.0, readings.t / 60.0, 0.0, (), steadily)]
@@ -451,6 +441,17 @@ class HeldLoad:
         offset = HOLD.other.offset * BAR
         mean = max(float(np.mean(np.abs(driving) ** exponent)) ** (1.0 / exponent), LEAST_DRIVE * offset)
         return weight, (reference / mean) ** exponent, exponent * offset / mean
+
+    def _weigh_by_law(
+        self, readings: Readings, t: Array, warmth: Array, exponent: float, drive: Array, slope: float
+    ) -> Array:
+        """Compute the times [min] of a leak by a `drive` [Pa] to the power `exponent`, and by the oil's viscosity.
+
+        `drive`, `warmth` (m,): pressure difference, and temperature less its mean [K], at times `t` (m,); `slope`: fall
+        of the logarithm of the viscosity, per kelvin.
+        """
+        flow = np.sign(drive) * np.abs(drive) ** exponent * np.exp((2.0 * exponent - 1.0) * slope * warmth)
+        return self._weigh_time(readings, t, flow)
 
     def _weigh_time(self, readings: Readings, t: Array, flow: Array) -> Array:
         """Compute times [min] of `readings` weighted by a `flow` at times `t` over its mean."""

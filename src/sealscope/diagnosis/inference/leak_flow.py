@@ -125,7 +125,8 @@ def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Informa
         return None
     # of equal p-values, such as 1, the highest score counts
     best, _ = min(tests, key=lambda pair: (pair[0].chance / pair[1], -pair[0].score))
-    return best.share_alarms(sum(prior * best.chance / max(test.chance, _TINY) for test, prior in tests))
+    least = max(best.chance, _TINY)  # a p-value may be too small for a float
+    return best.share_alarms(sum(prior * least / max(test.chance, _TINY) for test, prior in tests))
 
 
 def mixture_flow(probabilities: Array, flows: Array, deviations: Array) -> Estimate:

@@ -248,6 +248,7 @@ class HeldPriors(PriorTable):
     averaging_time: float  # [s] time over which the speed is averaged
     least_leakage: float  # smallest leakage of a pump over its mean flow
     ambiguous_share: float  # fraction of a test function's weight in which noise may change the sign of p_A - p_B
+    ramp_share: float  # fraction of the samples in motion whose command is within the dead band
     null_distance: float  # largest distance of a command from its null where a valve is shut, over the dead band
     creep_speed: float  # [m/s] largest speed of a load that shut valves hold
 

@@ -60,8 +60,6 @@ if TYPE_CHECKING:
 _PRIORS = INFERENCE.held
 #: Half-width of the test functions over holds [s].
 HOLD_HALF_WIDTH: float = _PRIORS.half_width
-#: Fraction of the commands in motion that are nearer to the null than those that count as the least ones.
-NULL_QUANTILE = 0.1
 #: Channels that these balances read: none of their terms needs the pressures at the ports.
 _READ = tuple(name for name in READ if name not in ("p_1", "p_2"))
 
@@ -138,9 +136,10 @@ def cycle_balances(recording: Recording, rig: Rig) -> list[CycleBalance]:
 def _find_command_rests(signals: Signals) -> NDArray[np.bool_]:
     """Flag the sampling intervals (n - 1,) in which a constant command u is near its null, where a valve is shut.
 
-    The null is the middle between the commands that move the piston out and in, of which the fraction `NULL_QUANTILE`
-    is nearer to it. u may differ from it by the fraction `held.null_distance` (`priors.toml`) of the distance between
-    them: a control loop that feeds what leaks has a larger command. Nothing is flagged without motion both ways.
+    The null is the middle between the least commands that move the piston out and in: a fraction `held.ramp_share` of
+    the commands in motion is nearer to it. u may differ from it by the fraction `held.null_distance` of the distance
+    between the least commands (`priors.toml`): a control loop that feeds what leaks has a larger command. Nothing is
+    flagged without motion both ways.
     """
     step, command = signals.step("x"), signals.mean("u")
     is_moving = ~find_rests(step, signals.rate, rest_limit(step, signals.rate, _PRIORS.held_speed))
@@ -150,8 +149,8 @@ def _find_command_rests(signals: Signals) -> NDArray[np.bool_]:
         return np.zeros_like(is_moving)
     sense = np.sign(np.median(outward) - np.median(inward))
     least_outward, least_inward = (
-        float(np.quantile(sense * outward, NULL_QUANTILE)),
-        float(np.quantile(sense * inward, 1.0 - NULL_QUANTILE)),
+        float(np.quantile(sense * outward, _PRIORS.ramp_share)),
+        float(np.quantile(sense * inward, 1.0 - _PRIORS.ramp_share)),
     )
     distance = np.abs(sense * command - 0.5 * (least_outward + least_inward))
     is_near_null = distance < _PRIORS.null_distance * (least_outward - least_inward)
