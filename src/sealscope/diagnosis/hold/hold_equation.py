@@ -445,16 +445,12 @@ class HeldLoad:
     def _weigh_by_law(
         self, readings: Readings, t: Array, warmth: Array, exponent: float, drive: Array, slope: float
     ) -> Array:
-        """Compute the times [min] of a leak by a `drive` [Pa] to the power `exponent`, and by the oil's viscosity.
+        """Compute times [min] of `readings` weighted by a leak's flow over its mean, by a law of the power `exponent`.
 
-        `drive`, `warmth` (m,): pressure difference, and temperature less its mean [K], at times `t` (m,); `slope`: fall
-        of the logarithm of the viscosity, per kelvin.
+        `drive`, `warmth` (m,): pressure difference [Pa], and temperature less its mean [K], at times `t` (m,); `slope`:
+        fall of the logarithm of the viscosity, per kelvin.
         """
         flow = np.sign(drive) * np.abs(drive) ** exponent * np.exp((2.0 * exponent - 1.0) * slope * warmth)
-        return self._weigh_time(readings, t, flow)
-
-    def _weigh_time(self, readings: Readings, t: Array, flow: Array) -> Array:
-        """Compute times [min] of `readings` weighted by a `flow` at times `t` over its mean."""
         steps = 0.5 * (flow[1:] + flow[:-1]) * np.diff(t)
         volume = flow[0] * t[0] + np.concatenate([[0.0], np.cumsum(steps)])
         total = float(volume[-1] + flow[-1] * (self.duration - t[-1]))
